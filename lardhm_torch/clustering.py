@@ -1,0 +1,270 @@
+"""Points to clusters: where the features sit and how wide they are.
+
+Mini-batch k-means (Algorithm 1) finds the centers; the mean and scatter of the points nearest to
+each center are its moments (eq. 6, 7), which pool exactly when clusters merge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lardhm_torch.features import nearest_centers
+
+POINTS_PER_CLUSTER = 20  # of the rule that chooses the number of clusters
+MAX_CHOSEN = 3000  # a class
+MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Moments of M clusters: enough to pool them, nothing that training changes.
+
+    Args:
+        counts: (M,) int64 number of points.
+        means: (M, D) mean position [m], eq. (6).
+        scatters: (M, D, D) sum of outer products of the offsets from the mean [m^2].
+    """
+
+    counts: Tensor
+    means: Tensor
+    scatters: Tensor
+
+    def __len__(self) -> int:
+        """Number of clusters M."""
+        return len(self.counts)
+
+    @property
+    def covariances(self) -> Tensor:
+        """(M, D, D) sample covariances [m^2], eq. (7); zero for a single point."""
+        return self.scatters / (self.counts - 1).clamp(min=1)[:, None, None]
+
+
+def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> Clusters:
+    """At most ``num_clusters`` clusters of the points, none of fewer than five unless there are fewer.
+
+    Args:
+        points: (N, D) positions of one class [m].
+        num_clusters: how many to look for; more than N / 5 means N / 5.
+        rng: random state of the start and of the batches.
+
+    Source: Guizilini & Ramos 2016, Algorithm 1, eq. (6), (7) and Section IV-B.
+    """
+    num_clusters = max(1, min(num_clusters, len(points) // MIN_COUNT))
+    centers = mini_batch_kmeans(points, num_clusters, rng)
+    labels = nearest_centers(points, centers, 1).squeeze(1)
+    return merge_small(cluster_moments(points, labels, num_clusters))
+
+
+def cluster_classes(
+    points: Tensor, labels: Tensor, num_clusters: int | None, rng: torch.Generator
+) -> tuple[Clusters, Tensor]:
+    """Occupied and free points clustered apart, as the paper found to work better (Section II-B).
+
+    Args:
+        points: (N, D) positions [m].
+        labels: (N,) 1 occupied, 0 free.
+        num_clusters: total over both classes; None: chosen from the data.
+        rng: random state.
+
+    Returns:
+        (M clusters, the occupied ones first; (M,) bool, which are occupied).
+    """
+    classes = [points[labels > 0.5], points[labels <= 0.5]]
+    totals = split_clusters([len(members) for members in classes], num_clusters)
+    parts = [
+        cluster_points(members, total, rng)
+        for members, total in zip(classes, totals, strict=True)
+        if len(members)
+    ]
+    is_occupied = torch.zeros(sum(map(len, parts)), dtype=torch.bool, device=points.device)
+    is_occupied[: len(parts[0]) if len(classes[0]) else 0] = True
+    return concatenate_clusters(parts), is_occupied
+
+
+def concatenate_clusters(parts: list[Clusters]) -> Clusters:
+    """All clusters of several, in order."""
+    return Clusters(
+        torch.cat([part.counts for part in parts]),
+        torch.cat([part.means for part in parts]),
+        torch.cat([part.scatters for part in parts]),
+    )
+
+
+def split_clusters(class_sizes: list[int], num_clusters: int | None) -> list[int]:
+    """How many clusters each of the two classes gets.
+
+    Half each, the odd one to the occupied class; a class that cannot fill its half (five points a
+    cluster) leaves the rest to the other. ``None``: one for every `POINTS_PER_CLUSTER` occupied
+    points and at most `MAX_CHOSEN` a class, the same number for free space, whose samples are as
+    many as the sampler was asked for and so say nothing about the scene. More clusters than that
+    are starved of points, and accuracy falls (paper, Section IV-B).
+    """
+    room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
+    if num_clusters is None:
+        basis = class_sizes[0] or class_sizes[1]
+        chosen = min(MAX_CHOSEN, max(1, basis // POINTS_PER_CLUSTER))
+        return [min(chosen, space) for space in room]
+    occupied = min(room[0], max(-(-num_clusters // 2), num_clusters - room[1]))
+    return [occupied, min(room[1], num_clusters - occupied)]
+
+
+def mini_batch_kmeans(
+    points: Tensor,
+    num_clusters: int,
+    rng: torch.Generator,
+    *,
+    iterations: int = 20,
+    batch_size: int | None = None,
+    restart_every: int = 5,
+) -> Tensor:
+    """Centers that are near to all points on average.
+
+    Every batch point pulls its nearest center by 1 / (number of points that pulled it so far); a
+    whole batch at a time this is the running mean of all points a center has met. We depart from
+    Algorithm 1 twice, because each lowers the inertia by several percent: the random points of the
+    start are spread along a space-filling curve, and the counters start anew every
+    ``restart_every`` iterations, so that a center forgets the points it met on its way.
+
+    Args:
+        points: (N, D) positions [m].
+        num_clusters: how many, at most N.
+        rng: random state of the start and of the batches.
+        iterations: t of Algorithm 1.
+        batch_size: b of Algorithm 1; None: 10 points a center.
+        restart_every: iterations between fresh counters.
+
+    Returns:
+        (num_clusters, D) centers [m].
+
+    Source: Guizilini & Ramos 2016, Algorithm 1.
+    """
+    batch_size = min(len(points), batch_size or 10 * num_clusters)
+    centers = _stratified_start(points, num_clusters, rng)
+    met = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
+    for iteration in range(iterations):
+        if iteration % restart_every == 0:
+            met.zero_()
+        batch = points[torch.randint(len(points), (batch_size,), generator=rng, device=rng.device)]
+        labels = nearest_centers(batch, centers, 1).squeeze(1)
+        pulls = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
+        met += torch.bincount(labels, minlength=num_clusters)
+        centers = centers + pulls / met.clamp(min=1)[:, None]
+    return centers
+
+
+def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -> Tensor:
+    """Random points, one from each of m stretches of the Z-order that are equally long in meters.
+
+    A stretch is weighted by the distance between points a quarter of a cluster apart in the order:
+    where points are sparse they are picked more often than their number says. Inertia is least
+    at a density of centers between that of the points and uniform, and starts near it.
+    """
+    ordered = points[z_order(points).argsort(stable=True)]
+    lag = max(1, len(points) // (4 * num_clusters))
+    gaps = torch.linalg.vector_norm(ordered[lag:] - ordered[:-lag], dim=1)
+    ahead = torch.cat([gaps, gaps[-1:].expand(lag)])
+    behind = torch.cat([gaps[:1].expand(lag), gaps])
+    weight = torch.minimum(ahead, behind).double()
+    along = (weight + 1e-6 * weight.mean() + 1e-300).cumsum(0)
+    share = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
+    place = (torch.arange(num_clusters, device=rng.device) + share) / num_clusters * along[-1]
+    return ordered[torch.searchsorted(along, place).clamp(max=len(points) - 1)]
+
+
+def z_order(points: Tensor) -> Tensor:
+    """(N, D) positions -> (N,) place along a space-filling curve (Morton code), int64."""
+    bits = min(16, 62 // points.shape[1])
+    lower, upper = points.amin(dim=0), points.amax(dim=0)
+    edge = (upper - lower).max().clamp(min=torch.finfo(points.dtype).tiny)
+    cells = ((points - lower) / edge * (2**bits - 1)).long()
+    code = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    for bit in range(bits):
+        for axis in range(points.shape[1]):
+            code |= ((cells[:, axis] >> bit) & 1) << (bit * points.shape[1] + axis)
+    return code
+
+
+def cluster_moments(points: Tensor, labels: Tensor, num_clusters: int) -> Clusters:
+    """Count, mean and scatter of the points of each label.
+
+    Source: Guizilini & Ramos 2016, eq. (6), (7).
+    """
+    counts = torch.bincount(labels, minlength=num_clusters)
+    shape = (num_clusters, points.shape[1])
+    anchor = points.new_zeros(shape).index_copy_(0, labels, points)  # any member: keeps digits
+    offsets = points - anchor[labels]
+    shift = points.new_zeros(shape).index_add_(0, labels, offsets)
+    means = anchor + shift / counts.clamp(min=1)[:, None]
+    offsets = points - means[labels]
+    outer = offsets[:, :, None] * offsets[:, None, :]
+    scatters = points.new_zeros(*shape, shape[1]).index_add_(0, labels, outer)
+    return Clusters(counts, means, scatters)
+
+
+def pool_clusters(clusters: Clusters, groups: Tensor, num_groups: int) -> Clusters:
+    """Clusters of one group become one, with the exact moments of all their points.
+
+    The scatter about the common mean is the sum of the scatters plus n d d^T for every cluster's
+    distance d from that mean.
+
+    Args:
+        clusters: M clusters.
+        groups: (M,) group of each, 0 to num_groups - 1.
+        num_groups: how many groups.
+    """
+    shares = clusters.counts.to(clusters.means.dtype)
+    counts = clusters.counts.new_zeros(num_groups).index_add_(0, groups, clusters.counts)
+    shape = (num_groups, clusters.means.shape[1])
+    anchor = clusters.means.new_zeros(shape).index_copy_(0, groups, clusters.means)
+    offsets = (clusters.means - anchor[groups]) * shares[:, None]
+    shift = clusters.means.new_zeros(shape).index_add_(0, groups, offsets)
+    means = anchor + shift / counts.clamp(min=1)[:, None]
+    apart = clusters.means - means[groups]
+    between = shares[:, None, None] * apart[:, :, None] * apart[:, None, :]
+    scatters = between.new_zeros(*shape, shape[1]).index_add_(
+        0, groups, clusters.scatters + between
+    )
+    return Clusters(counts, means, scatters)
+
+
+def merge_small(clusters: Clusters, min_count: int = MIN_COUNT) -> Clusters:
+    """Clusters of fewer than ``min_count`` points are pooled with their nearest large neighbor.
+
+    Empty clusters go. Where every cluster is small, the largest takes all.
+
+    Source: Guizilini & Ramos 2016, Section IV-B.
+    """
+    large = clusters.counts >= min_count
+    if bool(large.all()):
+        return clusters
+    if not bool(large.any()):
+        large[clusters.counts.argmax()] = True
+    kept = large.nonzero().squeeze(1)
+    groups = torch.empty_like(clusters.counts)
+    groups[kept] = torch.arange(len(kept), device=kept.device)
+    small = (~large).nonzero().squeeze(1)
+    groups[small] = nearest_centers(clusters.means[small], clusters.means[kept], 1).squeeze(1)
+    return pool_clusters(clusters, groups, len(kept))
+
+
+def factor_covariances(covariances: Tensor, floor: float) -> Tensor:
+    """Lower Cholesky factors, valid for flat, line-like and single-point clusters too.
+
+    ``floor``^2 is added to every variance: no axis is thinner than ``floor``, a single point
+    becomes a ball of that size, and wide clusters hardly change. A relative 1e-6 of the largest
+    variance keeps long thin clusters factorable in float32.
+
+    Args:
+        covariances: (M, D, D) [m^2], positive semi-definite up to rounding.
+        floor: smallest standard deviation [m].
+
+    Returns:
+        (M, D, D) lower factors [m] with positive diagonals.
+    """
+    largest = covariances.diagonal(dim1=-2, dim2=-1).amax(dim=-1)
+    ridge = floor**2 + 1e-6 * largest
+    eye = torch.eye(covariances.shape[-1], dtype=covariances.dtype, device=covariances.device)
+    return torch.linalg.cholesky(covariances + ridge[:, None, None] * eye)

@@ -1,0 +1,184 @@
+"""The definition: k nearest centers, the LARD kernel, the sparse feature matrix.
+
+Everything here is plain torch, on any device, dtype and dimension; `native` answers the same faster.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+from torch import Tensor
+
+CHUNK_ENTRIES = 1 << 23  # distances held at a time by the exhaustive search
+KDTREE_MIN_CENTERS = 64  # below this the exhaustive search is as fast
+QUERY_CHUNK = 1 << 17  # points whose features are held at a time by a query
+SPARE_CANDIDATES = 4  # neighbors asked beyond k, so that ties can be settled
+
+
+def squared_distances(points: Tensor, centers: Tensor) -> Tensor:
+    """(..., D) and (..., D), broadcast, -> (...) squared Euclidean distance [m^2].
+
+    The sum of squared differences, axis by axis: the expanded form |x|^2 - 2xc + |c|^2 loses all
+    digits far from the origin.
+    """
+    total = (points[..., 0] - centers[..., 0]).square()
+    for axis in range(1, points.shape[-1]):
+        total = total + (points[..., axis] - centers[..., axis]).square()
+    return total
+
+
+def nearest_centers(points: Tensor, centers: Tensor, num_neighbors: int) -> Tensor:
+    """The nearest centers of each point, exact; of equally near ones the lower index.
+
+    Searched by a k-d tree on the CPU, by torch-cluster on other devices where it is installed,
+    and exhaustively in chunks otherwise. No (N, M) matrix is ever held.
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m], same frame, dtype and device.
+        num_neighbors: how many; more than M means M.
+
+    Returns:
+        (N, K) int64 indices of centers, ascending in each row, K = min(num_neighbors, M).
+
+    Source: Guizilini & Ramos 2016, Section II-B.
+    """
+    return torch.ops.lardhm.plain_nearest(points.detach(), centers.detach(), num_neighbors)
+
+
+@torch.library.custom_op("lardhm::plain_nearest", mutates_args=())
+def _plain_nearest(points: Tensor, centers: Tensor, num_neighbors: int) -> Tensor:
+    k = min(num_neighbors, len(centers))
+    if len(points) == 0 or k == 0:
+        return torch.empty(len(points), k, dtype=torch.long, device=points.device)
+    if k == len(centers):
+        return torch.arange(k, device=points.device).repeat(len(points), 1)
+    candidates = None
+    if k + SPARE_CANDIDATES < len(centers) and len(centers) >= KDTREE_MIN_CENTERS:
+        if points.device.type == "cpu":
+            candidates = _kdtree_candidates(points, centers, k + SPARE_CANDIDATES)
+        elif importlib.util.find_spec("torch_cluster") is not None:
+            candidates = _torch_cluster_candidates(points, centers, k + SPARE_CANDIDATES)
+    if candidates is None:
+        return _exhaustive_nearest(points, centers, k)
+    indices, settled = _closest_candidates(points, centers, candidates, k)
+    if not bool(settled.all()):
+        indices[~settled] = _exhaustive_nearest(points[~settled], centers, k)
+    return indices
+
+
+@_plain_nearest.register_fake
+def _(points: Tensor, centers: Tensor, num_neighbors: int) -> Tensor:
+    k = min(num_neighbors, centers.shape[0])
+    return points.new_empty((points.shape[0], k), dtype=torch.long)
+
+
+def _kdtree_candidates(points: Tensor, centers: Tensor, count: int) -> Tensor:
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(centers.double())
+    finite = torch.where(points.isfinite(), points, 0).double()
+    _, indices = tree.query(finite, k=count, workers=torch.get_num_threads())
+    return torch.as_tensor(indices, dtype=torch.long)
+
+
+def _torch_cluster_candidates(points: Tensor, centers: Tensor, count: int) -> Tensor:
+    import torch_cluster
+
+    return torch_cluster.knn(centers, points, count)[1].reshape(len(points), count)
+
+
+def _closest_candidates(
+    points: Tensor, centers: Tensor, candidates: Tensor, k: int
+) -> tuple[Tensor, Tensor]:
+    """The k closest of each row, ties to the lower index, and which rows are certain.
+
+    A row is certain if its farthest candidate is clearly farther than its k-th: then no center
+    outside the candidates can belong to the k.
+    """
+    candidates = candidates.sort(dim=1).values
+    distances = squared_distances(points[:, None], centers[candidates])
+    order = distances.sort(dim=1, stable=True)
+    chosen = candidates.gather(1, order.indices[:, :k]).sort(dim=1).values
+    settled = order.values[:, k - 1] * (1 + 1e-5) < order.values[:, -1]
+    return chosen, settled
+
+
+def _exhaustive_nearest(points: Tensor, centers: Tensor, k: int) -> Tensor:
+    rows = max(1, CHUNK_ENTRIES // len(centers))
+    parts = []
+    for chunk in points.split(rows):
+        distances = squared_distances(chunk[:, None], centers[None])
+        nearest = distances.topk(k + 1, dim=1, largest=False, sorted=True)
+        indices = nearest.indices[:, :k].sort(dim=1).values
+        tied = ~(nearest.values[:, k - 1] < nearest.values[:, k])
+        if bool(tied.any()):
+            indices[tied] = distances[tied].sort(dim=1, stable=True).indices[:, :k].sort(1).values
+        parts.append(indices)
+    return torch.cat(parts)
+
+
+def lard_kernel(points: Tensor, centers: Tensor, scale_tril: Tensor, indices: Tensor) -> Tensor:
+    """Closeness of every point to its neighbors: 1 at a center, falling to 0.
+
+    phi_m(x) = exp(-|inv(L_m) (x - c_m)|^2 / 2), with covariance L_m L_m^T. The factor is applied by
+    forward substitution, one axis after the other; nothing is inverted.
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m].
+        scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
+        indices: (N, K) which clusters to evaluate for each point.
+
+    Returns:
+        (N, K) values in [0, 1], no unit.
+
+    Source: Guizilini & Ramos 2016, eq. (8).
+    """
+    offsets = points[:, None] - centers[indices]  # (N, K, D)
+    factors = scale_tril[indices]  # (N, K, D, D)
+    whitened: list[Tensor] = []
+    squared = torch.zeros_like(offsets[..., 0])
+    for row in range(points.shape[1]):
+        rest = offsets[..., row]
+        for column, solved in enumerate(whitened):
+            rest = rest - factors[..., row, column] * solved
+        whitened.append(rest / factors[..., row, row])
+        squared = squared + whitened[-1].square()
+    return torch.exp(-0.5 * squared)
+
+
+def nearest_features(
+    points: Tensor, centers: Tensor, scale_tril: Tensor, num_neighbors: int
+) -> tuple[Tensor, Tensor]:
+    """(N, K) indices of the nearest clusters, ascending, and (N, K) their kernel values.
+
+    Source: Guizilini & Ramos 2016, eq. (9) with Section II-B: all other values are zero.
+    """
+    indices = nearest_centers(points, centers, num_neighbors)
+    return indices, lard_kernel(points, centers, scale_tril, indices)
+
+
+def feature_matrix(indices: Tensor, values: Tensor, num_clusters: int) -> Tensor:
+    """(N, K) indices and values -> coalesced sparse COO (N, M), for `torch.sparse.mm`."""
+    rows = torch.arange(len(indices), device=indices.device)[:, None].expand_as(indices)
+    coordinates = torch.stack([rows.reshape(-1), indices.reshape(-1)])
+    return torch.sparse_coo_tensor(
+        coordinates, values.reshape(-1), (len(indices), num_clusters), is_coalesced=True
+    )
+
+
+def log_odds(
+    points: Tensor, centers: Tensor, scale_tril: Tensor, weights: Tensor, num_neighbors: int
+) -> Tensor:
+    """(N, D) positions [m] -> (N,) log-odds of occupied, w^T Phi(x); NaN where a point is not finite.
+
+    Source: Guizilini & Ramos 2016, eq. (1).
+    """
+    chunks = []
+    for chunk in points.split(QUERY_CHUNK):
+        indices, values = nearest_features(chunk, centers, scale_tril, num_neighbors)
+        total = (values * weights[indices]).sum(dim=1)
+        chunks.append(total.where(chunk.isfinite().all(dim=1), total.new_tensor(torch.nan)))
+    return torch.cat(chunks)

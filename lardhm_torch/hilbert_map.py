@@ -1,0 +1,336 @@
+"""The map: a torch module that owns the clusters and their weights."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lardhm_torch import checkpoint
+from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances
+from lardhm_torch.features import feature_matrix, log_odds, nearest_features
+from lardhm_torch.fitting import FitConfig, fit_weights, keep_features
+
+CACHE_BYTES = 1 << 28  # features of the training points are kept for all passes up to this size
+
+
+class LardHilbertMap(nn.Module):
+    """Continuous occupancy: a weighted sum of local kernel features gives the log-odds.
+
+    An empty map, and any place far from every cluster, says nothing: probability exactly 1/2.
+    Points are given in the world frame; ``origin`` is subtracted in float64 before they are cast to
+    the map's dtype, so that coordinates may be far from zero. A point with a NaN or infinite
+    coordinate has probability NaN.
+
+    Args:
+        dim: number of coordinates D.
+        num_neighbors: k nearest clusters that answer for a point.
+        covariance_scale: factor on the clusters' covariances.
+        min_lengthscale: no kernel axis is thinner [m], before ``covariance_scale``.
+
+    Attributes:
+        weights: (M,) parameter, learned.
+        centers: (M, D) parameter [m], map frame.
+        raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with the logarithm of their
+            diagonals: any value is a valid factor. `scale_tril` is the kernel's.
+        is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters.
+        origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
+
+    Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
+    """
+
+    weights: nn.Parameter
+    centers: nn.Parameter
+    raw_scale_tril: nn.Parameter
+    is_occupied: Tensor
+    counts: Tensor
+    means: Tensor
+    scatters: Tensor
+    origin: Tensor
+
+    def __init__(
+        self,
+        dim: int = 3,
+        num_neighbors: int = 5,
+        *,
+        covariance_scale: float = 4.0,
+        min_lengthscale: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if dim < 1:
+            raise ValueError(f"dim must be 1 or more; got {dim}")
+        if num_neighbors < 1:
+            raise ValueError(f"num_neighbors must be 1 or more; got {num_neighbors}")
+        if not covariance_scale > 0 or not min_lengthscale > 0:
+            raise ValueError(
+                "covariance_scale and min_lengthscale must be > 0; "
+                f"got {covariance_scale} and {min_lengthscale}"
+            )
+        self.dim = dim
+        self.num_neighbors = num_neighbors
+        self.covariance_scale = float(covariance_scale)
+        self.min_lengthscale = float(min_lengthscale)
+        self.weights = nn.Parameter(torch.zeros(0))
+        self.centers = nn.Parameter(torch.zeros(0, dim), requires_grad=False)
+        self.raw_scale_tril = nn.Parameter(torch.zeros(0, dim, dim), requires_grad=False)
+        self.register_buffer("is_occupied", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("counts", torch.zeros(0, dtype=torch.long))
+        self.register_buffer("means", torch.zeros(0, dim))
+        self.register_buffer("scatters", torch.zeros(0, dim, dim))
+        self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
+        self.register_load_state_dict_pre_hook(_make_room)
+
+    # --- what the map knows ---
+
+    def __len__(self) -> int:
+        """Number of clusters M."""
+        return len(self.weights)
+
+    @property
+    def scale_tril(self) -> Tensor:
+        """(M, D, D) lower Cholesky factors of the kernels [m]: covariance scale and floor included."""
+        lower = self.raw_scale_tril.tril(-1)
+        diagonal = self.raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
+        lower = lower + torch.diag_embed(diagonal.clamp(min=self.min_lengthscale))
+        return self.covariance_scale**0.5 * lower
+
+    def extra_repr(self) -> str:
+        """What `print(model)` shows."""
+        return (
+            f"dim={self.dim}, num_clusters={len(self)}, num_neighbors={self.num_neighbors}, "
+            f"covariance_scale={self.covariance_scale}, min_lengthscale={self.min_lengthscale}"
+        )
+
+    # --- what the map answers ---
+
+    def forward(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
+        return self._query(points, probability=True)
+
+    def log_odds(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
+        return self._query(points, probability=False)
+
+    def features(self, points: Tensor) -> Tensor:
+        """(N, D) world positions [m] -> sparse COO (N, M), K kernel values a row, eq. (9)."""
+        local = self._to_map_frame(points)
+        if local.ndim != 2:
+            raise ValueError(f"points must be (N, {self.dim}); got {tuple(points.shape)}")
+        state = (self.centers, self.scale_tril, self.num_neighbors)
+        indices, values = nearest_features(local, *state)
+        return feature_matrix(indices, values, len(self))
+
+    def _query(self, points: Tensor, probability: bool) -> Tensor:
+        local = self._to_map_frame(points)
+        state = (self.centers, self.scale_tril, self.weights, self.num_neighbors)
+        answer = log_odds(local.reshape(-1, self.dim), *state).reshape(local.shape[:-1])
+        return torch.sigmoid(answer) if probability else answer
+
+    def _to_map_frame(self, points: Tensor) -> Tensor:
+        points = torch.as_tensor(points, device=self.origin.device)
+        if points.ndim == 0 or points.shape[-1] != self.dim:
+            raise ValueError(
+                f"points must be (..., {self.dim}), one row of coordinates per point; "
+                f"got {tuple(points.shape)}"
+            )
+        # The origin is whole meters: exact in float32 too, so float32 points lose nothing.
+        working = torch.promote_types(torch.promote_types(points.dtype, self.centers.dtype), torch.float32)
+        return (points.to(working) - self.origin.to(working)).to(self.centers.dtype)
+
+    # --- how the map learns ---
+
+    def fit(
+        self,
+        points: Tensor,
+        labels: Tensor,
+        num_clusters: int | None = None,
+        *,
+        seed: int = 0,
+        config: FitConfig | None = None,
+        progress: bool = False,
+    ) -> LardHilbertMap:
+        """Learn the map from labelled points; what it knew before is forgotten.
+
+        Each class is clustered on its own, the clusters' moments give centers and length-scales,
+        then the weights are trained. If anything fails, the map is as it was.
+
+        Args:
+            points: (N, D) world positions [m].
+            labels: (N,) 1 occupied, 0 free; one class alone is allowed.
+            num_clusters: total over both classes, half each; a class too small for its half
+                leaves the rest to the other, and no cluster is starved of points. None: chosen
+                from the data (`clustering.choose_num_clusters`).
+            seed: of clustering and training.
+            config: how the weights are trained.
+            progress: show a bar on a terminal.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points.
+
+        Source: Guizilini & Ramos 2016, Sections II and III.
+        """
+        points, labels = check_samples(points, labels, self.dim, self.origin.device)
+        if num_clusters is not None and num_clusters < 1:
+            raise ValueError(f"num_clusters must be 1 or more, or None; got {num_clusters}")
+        dtype = self.centers.dtype
+        rng = torch.Generator(device=points.device).manual_seed(seed)
+        origin = points.mean(dim=0).round()
+        local, labels = (points - origin).to(dtype), labels.to(dtype)
+        clusters, is_occupied = cluster_classes(local, labels, num_clusters, rng)
+        learned = LardHilbertMap(**self.settings).to(self.centers)
+        learned._grow(clusters, is_occupied, origin)
+        learned._train_weights(local, labels, config or FitConfig(), rng, progress)
+        self.load_state_dict(learned.state_dict())
+        return self
+
+    def _train_weights(
+        self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
+    ) -> None:
+        centers, scale_tril = self.centers.detach(), self.scale_tril.detach()
+
+        def features_of(rows: Tensor) -> tuple[Tensor, Tensor]:
+            return nearest_features(local[rows], centers, scale_tril, self.num_neighbors)
+
+        features = keep_features(features_of, len(local), CACHE_BYTES, local.device)
+        start = self.weights.detach()
+        weights = fit_weights(features, labels, start, config, rng, progress)
+        with torch.no_grad():
+            self.weights.copy_(weights)
+
+    def _grow(self, clusters: Clusters, is_occupied: Tensor, origin: Tensor) -> None:
+        """Take over clusters as centers and length-scales, with weights of 0."""
+        factors = factor_covariances(clusters.covariances, self.min_lengthscale)
+        _resize(self, len(clusters))
+        with torch.no_grad():
+            self.weights.zero_()
+            self.centers.copy_(clusters.means)
+            self.raw_scale_tril.copy_(raw_factors(factors))
+        self.is_occupied, self.counts = is_occupied, clusters.counts
+        self.means, self.scatters, self.origin = clusters.means, clusters.scatters, origin
+
+    # --- what the map is on disk ---
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The arguments that make an empty map like this one."""
+        return {
+            "dim": self.dim,
+            "num_neighbors": self.num_neighbors,
+            "covariance_scale": self.covariance_scale,
+            "min_lengthscale": self.min_lengthscale,
+        }
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Format version and settings, kept in the state dict beside the tensors."""
+        return {"format_version": checkpoint.FORMAT_VERSION, **self.settings}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Nothing to set: `_make_room` has checked that the settings agree."""
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the map to a file, atomically: `torch.save(model.state_dict(), path)`, but safe."""
+        checkpoint.save_state(self.state_dict(), path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:
+        """Read a map file, whether `save` or `torch.save(model.state_dict(), ...)` wrote it.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is not a map, is damaged, unsafe, or of a newer format.
+        """
+        state = checkpoint.load_state(path)
+        try:
+            settings = checkpoint.check_settings(state.get("_extra_state"))
+            model = cls(**settings).to(state["centers"].dtype)
+            model.load_state_dict(state)
+        except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:
+            raise ValueError(f"{os.fspath(path)} must hold a LardHilbertMap; {error}") from error
+        return model
+
+    def _apply(self, fn: Any, recurse: bool = True) -> LardHilbertMap:
+        """`.to()`, `.float()`, `.half()`: everything follows but the float64 of the origin."""
+        origin = self.origin
+        super()._apply(fn, recurse)
+        if self.origin.dtype != torch.float64:
+            self.origin = origin.to(self.origin.device)
+        return self
+
+
+def check_samples(
+    points: Tensor, labels: Tensor, dim: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Training pairs as (N, D) float64 points and (N,) labels, or a ValueError that says why not."""
+    points = torch.as_tensor(points, device=device).detach().to(torch.float64)
+    labels = torch.as_tensor(labels, device=device).detach()
+    if points.ndim != 2 or points.shape[1] != dim:
+        raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
+    if labels.shape != points.shape[:1]:
+        raise ValueError(
+            f"labels must be ({len(points)},), one per point; got {tuple(labels.shape)}"
+        )
+    if len(points) == 0:
+        raise ValueError("points must hold at least one point; got 0")
+    bad = ~points.isfinite().all(dim=1)
+    if bool(bad.any()):
+        raise ValueError(
+            f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
+            f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
+        )
+    wrong = (labels != 0) & (labels != 1)
+    if bool(wrong.any()):
+        value = labels[wrong][0].item()
+        cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
+        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
+    return points, labels
+
+
+def raw_factors(scale_tril: Tensor) -> Tensor:
+    """(M, D, D) lower factors -> the same with the logarithm of their diagonals."""
+    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
+    return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
+
+
+def _resize(model: LardHilbertMap, num_clusters: int) -> None:
+    """Room for another number of clusters; parameters stay the same objects, so optimizers see it."""
+    if len(model) == num_clusters:
+        return
+    for name, tensor in {**model._parameters, **model._buffers}.items():
+        if tensor is None or name == "origin":
+            continue
+        room = tensor.new_zeros(num_clusters, *tensor.shape[1:])
+        if isinstance(tensor, nn.Parameter):
+            torch.utils.swap_tensors(tensor, nn.Parameter(room, tensor.requires_grad))
+        else:
+            setattr(model, name, room)
+
+
+def _make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Before a state dict is loaded: check it whole, then take on its number of clusters."""
+    extra = checkpoint.check_settings(state.get(prefix + "_extra_state"))
+    differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
+    if differing:
+        name, (ours, theirs) = next(iter(differing.items()))
+        raise ValueError(
+            f"state_dict must be of a map with {name} = {ours}; got {theirs}. "
+            f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
+            "LardHilbertMap.load"
+        )
+    own = {**model._parameters, **model._buffers}
+    missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
+    if missing:
+        raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
+    num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
+    for name, tensor in own.items():
+        shape = tensor.shape if name == "origin" else (num_clusters, *tensor.shape[1:])
+        if state[prefix + name].shape != torch.Size(shape):
+            raise ValueError(
+                f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
+                f"got {tuple(state[prefix + name].shape)}"
+            )
+    _resize(model, num_clusters)

@@ -1,0 +1,116 @@
+"""PLY: ascii, binary little and big endian; the element "vertex" with properties x, y, z."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from lardhm_torch.io.readout import Readout, readout_from_columns
+from lardhm_torch.io.records import (
+    Columns,
+    Field,
+    bytes_left,
+    header_count,
+    header_lines,
+    read_ascii,
+    read_binary,
+    record_size,
+)
+
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_FORMATS = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
+    **{"short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2"},
+    **{"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    fields: list[Field] = field(default_factory=list)
+    has_list: bool = False
+
+
+@dataclass
+class _Header:
+    encoding: str
+    num_lines: int
+    elements: list[_Element]
+
+
+def read_ply(path: Path) -> Readout:
+    """The vertices of a PLY file as ray ends; ox, oy, oz of each vertex as sensor positions.
+
+    Elements before the vertices are skipped unless they are binary lists; what comes after the
+    vertices (faces) is not read.
+
+    Raises:
+        ValueError: the header is not one of PLY, or the file is shorter than it says.
+
+    Source: http://paulbourke.net/dataformats/ply/
+    """
+    with open(path, "rb") as file:
+        header = _read_header(file)
+        columns = _read_vertices(path, file, header)
+    return readout_from_columns(columns)
+
+
+def _read_header(file: BinaryIO) -> _Header:
+    """Everything up to end_header."""
+    lines = header_lines(file)
+    if next(lines) != ["ply"]:
+        raise ValueError("a PLY file must begin with the line 'ply'; this one does not")
+    encoding, elements = "", list[_Element]()
+    for number, words in enumerate(lines, start=2):
+        match words:
+            case ["end_header"]:
+                if not encoding:
+                    raise ValueError("the header needs a line 'format'; got none")
+                return _Header(encoding, number, elements)
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", str(name), *_] if name in _BYTE_ORDERS and not elements:
+                encoding = name
+            case ["element", name, count]:
+                elements.append(_Element(name, header_count(count, f"element {name}")))
+            case ["property", "list", _, _, _] if elements:
+                elements[-1].has_list = True
+            case ["property", kind, name] if elements and kind in _FORMATS:
+                format = _BYTE_ORDERS[encoding or "ascii"] + _FORMATS[kind]
+                elements[-1].fields.append(Field(name.lower(), format))
+            case _:
+                raise ValueError(f"line {number} of the header is not understood: {words[:6]}")
+    raise AssertionError("header_lines raises before it ends")
+
+
+def _read_vertices(path: Path, file: BinaryIO, header: _Header) -> Columns:
+    """The named columns of the element vertex."""
+    skip_lines = header.num_lines
+    for element in header.elements:
+        if element.name == "vertex":
+            if element.has_list:
+                raise ValueError("vertices with list properties are not supported")
+            if header.encoding == "ascii":
+                return read_ascii(path, skip_lines, element.fields, element.count, bytes_left(file))
+            return read_binary(file, element.fields, element.count)
+        skip_lines += element.count
+        if header.encoding != "ascii":
+            _skip_binary(file, element)
+    found = ", ".join(element.name for element in header.elements)
+    raise ValueError(f"an element vertex is needed; got {found or 'none'}")
+
+
+def _skip_binary(file: BinaryIO, element: _Element) -> None:
+    """Go past a binary element."""
+    if element.has_list:
+        raise ValueError(
+            f"binary lists before the vertices are not supported; got element {element.name}"
+        )
+    size = element.count * record_size(element.fields)
+    if size > bytes_left(file):
+        raise ValueError(f"element {element.name} needs {size} bytes; got {bytes_left(file)}")
+    file.seek(size, 1)

@@ -1,0 +1,128 @@
+"""What a reader found in a file, before it is known whether that is enough for Scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+COLUMN_NAMES = frozenset(
+    {"x", "y", "z", "ox", "oy", "oz", "scan_id", "is_return", "target_index", "return_number"}
+)
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Rays of one file, as arrays; None where the file says nothing.
+
+    Args:
+        ends: (R, D) float64 ray ends, world frame [m].
+        origins: (S, D) float64 sensor positions [m].
+        scan_id: (R,) int64 index into origins.
+        is_return: (R,) bool.
+        target_index: (R,) int64, 1 = first return of a pulse.
+        origin_is_placeholder: origins is what writers put when they know no pose.
+        origin_cure: how a file of this format can carry its sensor position.
+    """
+
+    ends: NDArray[np.float64]
+    origins: NDArray[np.float64] | None = None
+    scan_id: NDArray[np.int64] | None = None
+    is_return: NDArray[np.bool_] | None = None
+    target_index: NDArray[np.int64] | None = None
+    origin_is_placeholder: bool = False
+    origin_cure: str = "Add columns ox oy oz"
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates D."""
+        return self.ends.shape[1]
+
+    @property
+    def needs_origin(self) -> bool:
+        """Whether a sensor position given by the caller has a place here."""
+        return self.origins is None or self.origin_is_placeholder
+
+    @property
+    def num_scans(self) -> int:
+        """Number of scans S."""
+        if self.scan_id is None or not len(self.scan_id):
+            return 1
+        return int(self.scan_id.max()) + 1
+
+
+def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
+    """Named columns of equal length as rays: x y [z], ox oy [oz], scan_id, is_return, target_index.
+
+    Rows with the same scan_id and the same origin are one scan. Scans are numbered in ascending
+    scan_id, or, without one, in order of first appearance.
+
+    Raises:
+        ValueError: there is no x or y, no row, only part of an origin, or a value out of range.
+    """
+    names = [name for name in ("x", "y", "z") if name in columns]
+    if names[:2] != ["x", "y"]:
+        raise ValueError(f"columns x and y are needed; got {', '.join(columns) or 'none'}")
+    ends = np.stack([columns[name] for name in names], axis=1).astype(np.float64, copy=False)
+    if not len(ends):
+        raise ValueError("at least one point is needed; got none")
+    origin_names = [name for name in ("ox", "oy", "oz") if name in columns]
+    if origin_names and origin_names != ["o" + name for name in names]:
+        raise ValueError(
+            f"the origin needs the columns {', '.join('o' + name for name in names)}; "
+            f"got {', '.join(origin_names)}"
+        )
+    origins, scan_id = _scans_of_rows(columns, origin_names)
+    target = columns.get("target_index", columns.get("return_number"))
+    is_return = columns.get("is_return")
+    return Readout(
+        ends,
+        origins,
+        scan_id,
+        None if is_return is None else whole_numbers(is_return, "is_return", 0, 1).astype(bool),
+        None if target is None else whole_numbers(target, "target_index", 1, 2**31),
+    )
+
+
+def whole_numbers(values: NDArray, name: str, lowest: int, highest: int) -> NDArray[np.int64]:
+    """(R,) values as int64.
+
+    Raises:
+        ValueError: one is not a whole number from lowest to highest.
+    """
+    fits = (values >= lowest) & (values <= highest) & (values == np.floor(values))
+    if not fits.all():
+        row = int(np.argmin(fits))
+        raise ValueError(
+            f"{name} must be a whole number from {lowest} to {highest}; "
+            f"got {values[row]} at row {row}"
+        )
+    return values.astype(np.int64)
+
+
+def _scans_of_rows(
+    columns: Mapping[str, NDArray], origin_names: list[str]
+) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None]:
+    """((S, D) origins, (R,) scan_id) from what tells the rows apart; None where nothing does."""
+    keys = [np.asarray(columns[name], dtype=np.float64) for name in origin_names]
+    if "scan_id" in columns:
+        whole_numbers(columns["scan_id"], "scan_id", -(2**31), 2**31)
+        keys.insert(0, columns["scan_id"].astype(np.float64))
+    if not keys:
+        return None, None
+    rows = np.stack(keys, axis=1)
+    if not np.isfinite(rows).all():
+        row = int(np.argmin(np.isfinite(rows).all(axis=1)))
+        raise ValueError(f"{', '.join(origin_names)} must be finite; got {rows[row]} at row {row}")
+    # Rows of one scan usually follow each other: sorting the first row of each run is enough.
+    starts = np.flatnonzero(np.r_[True, (rows[1:] != rows[:-1]).any(axis=1)])
+    scans, first, number = np.unique(rows[starts], axis=0, return_index=True, return_inverse=True)
+    number = number.reshape(-1)  # NumPy 2.0 alone returns (n, 1) here
+    if "scan_id" not in columns:
+        order = np.argsort(first)
+        scans, number = scans[order], np.argsort(order)[number]
+    scan_id = np.repeat(number, np.diff(np.r_[starts, len(rows)])).astype(np.int64)
+    origins = scans[:, -len(origin_names) :] if origin_names else None
+    return origins, scan_id

@@ -1,0 +1,143 @@
+"""Equal records in a row: the body of PLY and PCD files, as text or as bytes."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lardhm_torch.io.readout import COLUMN_NAMES
+
+Columns = dict[str, NDArray[np.float64]]
+_MAX_HEADER_LINES = 10_000
+_MAX_LINE_BYTES = 65_536
+
+
+@dataclass(frozen=True)
+class Field:
+    """One entry of a record: its name, its NumPy format such as "<f4", how many values it has."""
+
+    name: str
+    format: str
+    count: int = 1
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of the field in a binary record."""
+        return self.count * np.dtype(self.format).itemsize
+
+
+def record_size(fields: Sequence[Field]) -> int:
+    """Bytes of one binary record."""
+    return sum(field.num_bytes for field in fields)
+
+
+def header_lines(file: BinaryIO) -> Iterator[list[str]]:
+    """The words of each header line, until the caller has seen the last one.
+
+    Raises:
+        ValueError: the file ends, or something that is no header goes on for ever.
+    """
+    for _ in range(_MAX_HEADER_LINES):
+        line = file.readline(_MAX_LINE_BYTES)
+        if not line.endswith(b"\n"):
+            raise ValueError(f"the header must end before the file does; got {line[:40]!r} last")
+        yield line.decode("latin-1").split()
+    raise ValueError(f"the header must end within {_MAX_HEADER_LINES} lines; it does not")
+
+
+def header_count(word: str, name: str) -> int:
+    """A count in a header: digits only, because int() also takes signs and underscores."""
+    if not (word.isascii() and word.isdigit() and len(word) < 16):
+        raise ValueError(f"{name} must be a count; got {word[:40]!r}")
+    return int(word)
+
+
+def bytes_left(file: BinaryIO) -> int:
+    """How many bytes of the file are still unread."""
+    return os.fstat(file.fileno()).st_size - file.tell()
+
+
+def read_binary(file: BinaryIO, fields: Sequence[Field], count: int) -> Columns:
+    """The named columns of count binary records at the file's position.
+
+    Raises:
+        ValueError: the file has fewer bytes than that.
+    """
+    size = record_size(fields)
+    if count * size > bytes_left(file):
+        raise ValueError(
+            f"{count} points of {size} bytes are promised, {count * size} bytes; "
+            f"got {bytes_left(file)}"
+        )
+    wanted, offset = {}, 0
+    for field in fields:
+        if field.name in COLUMN_NAMES:
+            wanted[field.name] = (np.dtype(field.format), offset)
+        offset += field.num_bytes
+    records = np.fromfile(file, np.dtype((np.void, size)), count)
+    return {
+        name: np.ndarray(count, dtype, records, offset, (size,)).astype(np.float64)
+        for name, (dtype, offset) in wanted.items()
+    }
+
+
+def read_ascii(
+    path: Path, skip_lines: int, fields: Sequence[Field], count: int, left: int
+) -> Columns:
+    """The named columns of count lines of text after skip_lines, in a file with left bytes left.
+
+    Raises:
+        ValueError: there are fewer lines, or a word is no number.
+    """
+    shortest = 2 * sum(field.count for field in fields)  # a digit and a separator each
+    if count * shortest > left + 1:
+        raise ValueError(
+            f"{count} points of {shortest // 2} numbers are promised; {left} bytes are too few"
+        )
+    wanted, column = {}, 0
+    for field in fields:
+        if field.name in COLUMN_NAMES:
+            wanted[field.name] = column
+        column += field.count
+    if count == 0 or not wanted:
+        return {name: np.empty(count) for name in wanted}
+    table = read_table(path, skip_lines, list(wanted.values()), max_rows=count, comments=None)
+    if len(table) != count:
+        raise ValueError(f"{count} points are promised; got {len(table)} lines")
+    return {name: table[:, i] for i, name in enumerate(wanted)}
+
+
+def read_table(
+    path: Path,
+    skip_lines: int,
+    columns: list[int],
+    *,
+    delimiter: str | None = None,
+    max_rows: int | None = None,
+    comments: str | None = "#",
+) -> NDArray[np.float64]:
+    """(R, C) numbers of a text file; blank lines are passed over.
+
+    Raises:
+        ValueError: a word is no number, or a line is too short.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # blank lines, no line: the caller counts
+        return np.loadtxt(
+            path,
+            dtype=np.float64,
+            skiprows=skip_lines,
+            usecols=columns,
+            delimiter=delimiter,
+            max_rows=max_rows,
+            comments=comments,
+            encoding="latin-1",
+            ndmin=2,
+        )

@@ -1,0 +1,139 @@
+"""Rays to training pairs: hits are occupied, points on the ray before them are free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lardhm_torch.scans import Scans
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingConfig:
+    """How rays become labelled points.
+
+    The paper takes one free sample every one to two meters of a ray (Section II-A). On its own
+    that leaves the last stretch before the surface, where the map must turn from free to occupied,
+    almost without data; ``near_samples`` adds points there.
+    """
+
+    min_range: float = 0.3  # [m] shorter rays end in the sensor's own body and are dropped
+    max_range: float = 100.0  # [m] beyond it a ray is cut and has no hit
+    free_spacing: float = 1.0  # [m] one free sample for every such stretch of a ray
+    near_samples: int = 1  # free samples close in front of each hit
+    near_margin: float = 0.1  # [m] no free sample is closer to its own hit
+    near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_range < self.max_range < float("inf"):
+            raise ValueError(
+                "min_range and max_range must satisfy 0 <= min_range < max_range < inf; "
+                f"got {self.min_range} and {self.max_range}"
+            )
+        if not self.free_spacing > 0:
+            raise ValueError(f"free_spacing must be > 0 m; got {self.free_spacing}")
+        if self.near_samples < 0:
+            raise ValueError(f"near_samples must be 0 or more; got {self.near_samples}")
+        if not 0 <= self.near_margin < self.near_reach:
+            raise ValueError(
+                "near_margin and near_reach must satisfy 0 <= near_margin < near_reach; "
+                f"got {self.near_margin} and {self.near_reach}"
+            )
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Training pairs, world frame.
+
+    Args:
+        points: (N, D) float64 positions [m], the hits first.
+        labels: (N,) 1 occupied, 0 free.
+        ray_id: (N,) which ray of the scans a point lies on.
+        dropped: number of rays left out, by reason.
+    """
+
+    points: Tensor
+    labels: Tensor
+    ray_id: Tensor
+    dropped: dict[str, int]
+
+    def __len__(self) -> int:
+        """Number of points N."""
+        return len(self.points)
+
+
+def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str, int]]:
+    """Which rays can be sampled, and how many of the others there are, by reason.
+
+    Returns:
+        ((R,) mask, counts): NaN or infinite ends or origins; ends closer than ``min_range``
+        (zero-length rays among them), which lie in the sensor's own body; later returns of a
+        pulse, before which space is not free.
+    """
+    finite = scans.ends.isfinite().all(dim=1) & scans.ray_origins.isfinite().all(dim=1)
+    inside = finite & ~(scans.ranges >= max(config.min_range, 1e-9))
+    later = finite & ~inside & (scans.target_index > 1)
+    counts = {
+        "not finite": int((~finite).sum()),
+        f"shorter than {config.min_range} m": int(inside.sum()),
+        "later returns (hit kept, no free space)": int(later.sum()),
+    }
+    return finite & ~inside, counts
+
+
+def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
+    """Labelled points of the scans: every hit occupied, points on the ray before it free.
+
+    Each ray is cut into stretches of about ``free_spacing`` and gives one uniform point in each
+    (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
+    longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
+    returns of a pulse (``target_index`` > 1) give a hit but no free space.
+
+    Args:
+        scans: range scans, world frame.
+        config: spacings and limits; the defaults serve all scenes.
+        seed: of the random positions; the same seed gives the same samples.
+
+    Raises:
+        ValueError: no ray is usable; the message says why.
+
+    Source: Guizilini & Ramos 2016, Section II-A.
+    """
+    config = config or SamplingConfig()
+    keep, dropped = usable_rays(scans, config)
+    if not keep.any():
+        raise ValueError(f"scans must hold at least one usable ray of {len(scans)}; got {dropped}")
+    rays = keep.nonzero().squeeze(1)
+    origins, ranges = scans.ray_origins[rays], scans.ranges[rays]
+    directions = (scans.ends[rays] - origins) / ranges[:, None]
+    is_hit = scans.is_return[rays] & (ranges <= config.max_range)
+    first = scans.target_index[rays] == 1
+    reach = ranges.clamp(max=config.max_range)
+    free_end = torch.where(is_hit, (reach - config.near_margin).clamp(min=0), reach)
+    rng = torch.Generator(device=ranges.device).manual_seed(seed)
+    ray, depth = _free_depths(free_end, is_hit & first, config, rng, first)
+    hits = is_hit.nonzero().squeeze(1)
+    points = torch.cat([scans.ends[rays[hits]], origins[ray] + depth[:, None] * directions[ray]])
+    labels = torch.zeros(len(points), device=points.device)
+    labels[: len(hits)] = 1
+    return Samples(points, labels, torch.cat([rays[hits], rays[ray]]), dropped)
+
+
+def _free_depths(
+    free_end: Tensor, is_hit: Tensor, config: SamplingConfig, rng: torch.Generator, first: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(F,) ray number and (F,) depth [m] of every free sample, stratified ones first."""
+    device = free_end.device
+    strata = (free_end / config.free_spacing).round().long().clamp(min=1) * first
+    ray = torch.repeat_interleave(strata)
+    before = strata.cumsum(0) - strata
+    step = torch.arange(len(ray), device=device) - before[ray]
+    share = torch.rand(len(ray), generator=rng, device=device, dtype=free_end.dtype)
+    depth = (step + share) / strata[ray] * free_end[ray]
+    near = is_hit.nonzero().squeeze(1).repeat(config.near_samples)
+    share = torch.rand(len(near), generator=rng, device=device, dtype=free_end.dtype)
+    back = share * (config.near_reach - config.near_margin)
+    near_depth = (free_end[near] - back).clamp(min=0)
+    return torch.cat([ray, near]), torch.cat([depth, near_depth])

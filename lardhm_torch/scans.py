@@ -1,0 +1,157 @@
+"""Range scans: where the sensor stood and where its rays ended, in one world frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Rays of one or more scans, world frame, float64.
+
+    Ray r goes from ``origins[scan_id[r]]`` to ``ends[r]``. Coordinates may be far from zero (UTM).
+
+    Args:
+        origins: (S, D) sensor position of each scan [m].
+        ends: (R, D) end of each ray [m]: a hit, or a point up to which the beam met nothing.
+        scan_id: (R,) which scan a ray belongs to, 0 to S - 1; left out: all belong to scan 0.
+        is_return: (R,) True where the ray hit a surface; left out: all did.
+        target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; left out: all 1.
+
+    Raises:
+        ValueError: a tensor has the wrong shape, or a scan_id has no origin.
+    """
+
+    origins: Tensor
+    ends: Tensor
+    scan_id: Tensor = field(default=None)  # type: ignore[assignment]
+    is_return: Tensor = field(default=None)  # type: ignore[assignment]
+    target_index: Tensor = field(default=None)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        ends = torch.as_tensor(self.ends, dtype=torch.float64)
+        device = ends.device
+        origins = torch.as_tensor(self.origins, dtype=torch.float64, device=device)
+        if ends.ndim != 2 or origins.ndim != 2 or ends.shape[1] != origins.shape[1]:
+            raise ValueError(
+                "ends must be (R, D) and origins (S, D) with one D; "
+                f"got {tuple(ends.shape)} and {tuple(origins.shape)}"
+            )
+        rays = len(ends)
+        columns = {
+            "scan_id": (self.scan_id, torch.long, 0),
+            "is_return": (self.is_return, torch.bool, True),
+            "target_index": (self.target_index, torch.long, 1),
+        }
+        for name, (value, dtype, default) in columns.items():
+            if value is None:
+                value = torch.full((rays,), default, device=device)
+            value = torch.as_tensor(value, device=device).to(dtype)
+            if value.shape != (rays,):
+                raise ValueError(
+                    f"{name} must be ({rays},), one entry per ray; got {tuple(value.shape)}"
+                )
+            object.__setattr__(self, name, value)
+        if rays and (self.scan_id.min() < 0 or self.scan_id.max() >= len(origins)):
+            raise ValueError(
+                f"scan_id must be 0 to {len(origins) - 1}, one origin per scan; "
+                f"got {int(self.scan_id.min())} to {int(self.scan_id.max())}"
+            )
+        object.__setattr__(self, "origins", origins)
+        object.__setattr__(self, "ends", ends)
+
+    def __len__(self) -> int:
+        """Number of rays R."""
+        return len(self.ends)
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates D."""
+        return self.ends.shape[1]
+
+    @property
+    def num_scans(self) -> int:
+        """Number of scans S."""
+        return len(self.origins)
+
+    @property
+    def ray_origins(self) -> Tensor:
+        """(R, D) where each ray starts [m]."""
+        return self.origins[self.scan_id]
+
+    @property
+    def ranges(self) -> Tensor:
+        """(R,) length of each ray [m]."""
+        return torch.linalg.vector_norm(self.ends - self.ray_origins, dim=1)
+
+    @property
+    def hits(self) -> Tensor:
+        """(H, D) the ray ends that lie on a surface [m]."""
+        return self.ends[self.is_return]
+
+    def select(self, rays: Tensor) -> Scans:
+        """The given rays (mask or indices), with all origins kept so that scan_id keeps its meaning."""
+        return Scans(
+            self.origins,
+            self.ends[rays],
+            self.scan_id[rays],
+            self.is_return[rays],
+            self.target_index[rays],
+        )
+
+    def drop_constant_column(self) -> Scans:
+        """The same scans without their last column, which must be constant: z of a 2-D log.
+
+        Raises:
+            ValueError: the last column is not constant, so dropping it would lose something.
+        """
+        ends, origins = self.ends, self.origins
+        if len(ends):
+            spread = float(torch.cat([ends[:, -1], origins[:, -1]]).max() - ends[:, -1].min())
+            if spread > 1e-6:
+                raise ValueError(
+                    f"the last coordinate must be constant to be dropped; it spans {spread:.3g} m"
+                )
+        return Scans(
+            origins[:, :-1], ends[:, :-1], self.scan_id, self.is_return, self.target_index
+        )
+
+
+def concatenate_scans(parts: list[Scans]) -> Scans:
+    """All rays of several Scans in order, scan numbers counted on.
+
+    Raises:
+        ValueError: there are none, or their dimensions differ.
+    """
+    if not parts:
+        raise ValueError("parts must hold at least one Scans; got none")
+    dims = sorted({part.dim for part in parts})
+    if len(dims) > 1:
+        raise ValueError(f"all scans must have the same dimension; got {dims}")
+    before = [0]
+    for part in parts:
+        before.append(before[-1] + part.num_scans)
+    return Scans(
+        torch.cat([part.origins for part in parts]),
+        torch.cat([part.ends for part in parts]),
+        torch.cat([part.scan_id + n for part, n in zip(parts, before, strict=False)]),
+        torch.cat([part.is_return for part in parts]),
+        torch.cat([part.target_index for part in parts]),
+    )
+
+
+def split_rays(scans: Scans, ratio: float = 0.5, seed: int = 0) -> tuple[Scans, Scans]:
+    """Two sets of whole rays: a random share ``ratio`` and the rest.
+
+    Raises:
+        ValueError: ratio is not strictly between 0 and 1.
+    """
+    if not 0 < ratio < 1:
+        raise ValueError(f"ratio must be between 0 and 1, both excluded; got {ratio}")
+    rng = torch.Generator().manual_seed(seed)
+    order = torch.randperm(len(scans), generator=rng).to(scans.ends.device)
+    cut = round(ratio * len(scans))
+    return scans.select(order[:cut].sort().values), scans.select(order[cut:].sort().values)

@@ -1,0 +1,257 @@
+"""A furnished room of 40 m² and three laser scanners in it; the true surface is known.
+
+The room is made of boxes, upright cylinders and spheres inside a box-shaped shell with a doorway and
+a window, so that rays meet it in closed form and the ground-truth mesh is the same list of shapes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lardhm_torch.scans import Scans
+
+if TYPE_CHECKING:
+    import trimesh
+
+Box = tuple[float, float, float, float, float, float]  # x, y, z of the lower and the upper corner
+
+ROOM = (8.0, 5.0, 2.6)  # [m] the shell spans (0, 0, 0) to here
+MAX_RANGE = 10.0  # [m] length of a beam that leaves through an opening
+MAX_ELEVATION = math.radians(75)  # the scanners see neither straight up nor their own foot
+SCANNERS = ((1.7, 3.1, 1.35), (4.4, 0.8, 1.6), (6.4, 3.6, 1.2))  # [m]
+
+
+class Opening(NamedTuple):
+    """A hole in the wall where coordinate ``axis`` is 0 or largest; it spans u along the wall, and z."""
+
+    axis: int
+    far: bool
+    u: tuple[float, float]
+    z: tuple[float, float]
+
+
+OPENINGS = (
+    Opening(axis=1, far=False, u=(6.0, 6.9), z=(0.0, 2.05)),  # doorway
+    Opening(axis=0, far=False, u=(1.5, 3.3), z=(0.9, 2.1)),  # window
+)
+
+
+def _table(x: float, y: float, width: float, depth: float) -> list[Box]:
+    """A top on four legs; its lower corner stands at (x, y)."""
+    legs = [(x + i * (width - 0.07), y + j * (depth - 0.07)) for i in (0, 1) for j in (0, 1)]
+    top = (x, y, 0.71, x + width, y + depth, 0.75)
+    return [top, *((a, b, 0.0, a + 0.07, b + 0.07, 0.71) for a, b in legs)]
+
+
+def _chair(x: float, y: float, back_at: float) -> list[Box]:
+    """A seat of 0.44 m on four legs, its back at the lower (0) or the upper (1) y side."""
+    legs = [(x + i * 0.39, y + j * 0.39) for i in (0, 1) for j in (0, 1)]
+    seat = (x, y, 0.42, x + 0.44, y + 0.44, 0.47)
+    back = (x, y + back_at * 0.39, 0.47, x + 0.44, y + back_at * 0.39 + 0.05, 0.95)
+    return [seat, back, *((a, b, 0.0, a + 0.05, b + 0.05, 0.42) for a, b in legs)]
+
+
+def _sofa() -> list[Box]:
+    """Base, back and two arms, along the wall y = 5."""
+    arms = [(x, 4.1, 0.0, x + 0.2, 5.0, 0.62) for x in (0.5, 2.5)]
+    return [(0.7, 4.1, 0.0, 2.5, 5.0, 0.42), (0.7, 4.75, 0.42, 2.5, 5.0, 0.85), *arms]
+
+
+def _shelf() -> list[Box]:
+    """Two sides and five boards against the wall x = 8, open to the back."""
+    sides = [(7.65, y, 0.0, 8.0, y + 0.05, 2.0) for y in (3.0, 4.55)]
+    boards = [(7.65, 3.05, z, 8.0, 4.55, z + 0.04) for z in (0.1, 0.55, 1.0, 1.45, 1.96)]
+    return [*sides, *boards]
+
+
+BOXES: tuple[Box, ...] = (
+    *_table(2.2, 1.4, 1.7, 0.9),
+    *_chair(2.45, 0.85, back_at=0),
+    *_chair(3.2, 0.85, back_at=0),
+    *_chair(2.45, 2.4, back_at=1),
+    *_chair(3.2, 2.4, back_at=1),
+    *_sofa(),
+    *_shelf(),
+    (4.95, 3.3, 0.0, 5.07, 5.0, 2.6),  # partition wall
+    (7.4, 0.3, 0.0, 8.0, 1.9, 2.1),  # wardrobe
+    (5.3, 4.4, 0.0, 6.8, 5.0, 0.8),  # sideboard
+    (0.0, 0.0, 0.0, 0.5, 1.2, 0.9),  # chest
+)
+# x, y of the axis, radius, lower and upper z [m]
+CYLINDERS = (
+    (5.6, 1.7, 0.18, 0.0, 2.6),  # column
+    (1.6, 3.55, 0.3, 0.36, 0.42),  # coffee table: top and foot
+    (1.6, 3.55, 0.06, 0.0, 0.36),
+    (0.6, 3.7, 0.15, 0.0, 0.04),  # floor lamp: base and pole
+    (0.6, 3.7, 0.025, 0.04, 1.4),
+)
+# x, y, z of the center, radius [m]
+SPHERES = ((0.6, 3.7, 1.55, 0.2), (6.0, 4.7, 1.0, 0.2))  # shade of the lamp, globe
+
+
+def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) -> Scans:
+    """Rays of three laser scanners in a furnished room of 8 m x 5 m x 2.6 m.
+
+    Each scanner sends its third of the rays evenly over all directions up to 75 degrees above and
+    below the horizon (a spherical spiral, turned at random). Beams through the doorway or the window
+    do not return: ``is_return`` is False and they end after 10 m.
+
+    Args:
+        num_rays: rays of all scanners together.
+        noise: standard deviation of the range [m], Gaussian, along the beam. The paper writes
+            sigma² = N(0, 0.1), which leaves the unit open; 0.02 m is that of a common laser scanner.
+        seed: of the spirals' turn and of the noise.
+
+    Returns:
+        Scans with three origins, world frame.
+
+    Raises:
+        ValueError: num_rays is below 3, or noise is negative.
+
+    Source: Guizilini & Ramos 2016, Section IV-A (three simulated lasers, about 40 m², 50k points).
+    """
+    if num_rays < 3:
+        raise ValueError(f"num_rays must be at least 3, one per scanner; got {num_rays}")
+    if not noise >= 0:
+        raise ValueError(f"noise must be >= 0 m; got {noise}")
+    rng = torch.Generator().manual_seed(seed)
+    origins = torch.tensor(SCANNERS, dtype=torch.float64)
+    shares = [(num_rays + i) // len(SCANNERS) for i in range(len(SCANNERS))]
+    scan_id = torch.repeat_interleave(torch.arange(len(SCANNERS)), torch.tensor(shares))
+    directions = torch.cat([_spiral(share, rng) for share in shares])
+    ranges = true_ranges(origins[scan_id], directions)
+    is_return = ranges.isfinite()
+    error = noise * torch.randn(num_rays, generator=rng, dtype=torch.float64)
+    ranges = torch.where(is_return, (ranges + error).clamp(min=0.0), MAX_RANGE)
+    ends = origins[scan_id] + ranges[:, None] * directions
+    return Scans(origins, ends, scan_id, is_return)
+
+
+def true_ranges(origins: Tensor, directions: Tensor) -> Tensor:
+    """Distance along each ray to the first surface of the room, without noise.
+
+    Args:
+        origins: (R, 3) starts inside the room, outside the furniture, world frame [m].
+        directions: (R, 3) unit vectors.
+
+    Returns:
+        (R,) ranges [m]; infinite where the ray leaves through the doorway or the window.
+    """
+    ranges = _shell_ranges(origins, directions)
+    for box in BOXES:
+        near, far = _slab(origins, directions, origins.new_tensor(box))
+        ranges = torch.where((near <= far) & (near > 0), torch.minimum(ranges, near), ranges)
+    for x, y, radius, low, high in CYLINDERS:
+        round_near, round_far = _ball(origins, directions, (x, y), radius)
+        height = origins.new_tensor([low, high])
+        flat_near, flat_far = _slab(origins[:, 2:], directions[:, 2:], height)
+        near = torch.maximum(round_near, flat_near)
+        hit = (near <= torch.minimum(round_far, flat_far)) & (near > 0)
+        ranges = torch.where(hit, torch.minimum(ranges, near), ranges)
+    for *center, radius in SPHERES:
+        near, far = _ball(origins, directions, tuple(center), radius)
+        ranges = torch.where((near <= far) & (near > 0), torch.minimum(ranges, near), ranges)
+    return ranges
+
+
+def room_mesh() -> trimesh.Trimesh:
+    """The true surface of the room: shell and furniture, normals into the free space.
+
+    Faces of furniture that lie on the shell (the underside of a sofa) are left out. Shapes that touch
+    or enter each other stay whole: the parts inside are never hit by a ray.
+    """
+    import trimesh
+
+    parts = []
+    for box in BOXES:
+        parts.append(trimesh.creation.box(bounds=np.reshape(box, (2, 3))))
+    for x, y, radius, low, high in CYLINDERS:
+        part = trimesh.creation.cylinder(radius=radius, height=high - low, sections=96)
+        parts.append(part.apply_translation((x, y, (low + high) / 2)))
+    for *center, radius in SPHERES:
+        part = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+        parts.append(part.apply_translation(center))
+    furniture = trimesh.util.concatenate(parts)
+    corners = furniture.triangles  # (F, 3 corners, 3)
+    on_shell = [np.isclose(corners, wall).all(axis=1).any(axis=1) for wall in (0.0, ROOM)]
+    furniture.update_faces(~(on_shell[0] | on_shell[1]))
+    furniture.remove_unreferenced_vertices()
+    return trimesh.util.concatenate([furniture, _shell_mesh()])
+
+
+def _spiral(count: int, rng: torch.Generator) -> Tensor:
+    """(count, 3) unit vectors, even over the sphere between the two largest elevations."""
+    steps = torch.arange(count, dtype=torch.float64)
+    up = math.sin(MAX_ELEVATION) * (1 - (2 * steps + 1) / count)
+    golden_angle = math.pi * (3 - math.sqrt(5))
+    azimuth = golden_angle * steps + 2 * math.pi * torch.rand((), generator=rng).double()
+    flat = (1 - up.square()).sqrt()
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), up], dim=1)
+
+
+def _slab(origins: Tensor, directions: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Where lines enter and leave a box: (R,) near and far; near > far where they miss."""
+    lower, upper = corners.reshape(2, -1)
+    tiny = torch.finfo(directions.dtype).tiny  # a line along a face must not give 0 / 0
+    safe = torch.where(directions == 0, tiny, directions)
+    first, second = (lower - origins) / safe, (upper - origins) / safe
+    near = torch.minimum(first, second).amax(dim=1)
+    return near, torch.maximum(first, second).amin(dim=1)
+
+
+def _ball(
+    origins: Tensor, directions: Tensor, center: tuple[float, ...], radius: float
+) -> tuple[Tensor, Tensor]:
+    """Where lines enter and leave a ball, or in two coordinates an endless cylinder; as _slab."""
+    columns = len(center)
+    offset = origins[:, :columns] - origins.new_tensor(center)
+    heading = directions[:, :columns]
+    a = heading.square().sum(dim=1).clamp(min=1e-30)
+    half_b = (offset * heading).sum(dim=1)
+    c = offset.square().sum(dim=1) - radius**2
+    root = (half_b.square() - a * c).sqrt()  # NaN where the line misses
+    misses = root.isnan()
+    near, far = (-half_b - root) / a, (-half_b + root) / a
+    return near.masked_fill(misses, torch.inf), far.masked_fill(misses, -torch.inf)
+
+
+def _shell_ranges(origins: Tensor, directions: Tensor) -> Tensor:
+    """(R,) distance to walls, floor and ceiling from inside; infinite through an opening."""
+    corners = origins.new_tensor((0.0, 0.0, 0.0, *ROOM))
+    ranges = _slab(origins, directions, corners)[1]
+    ends = origins + ranges[:, None] * directions
+    for axis, far, u, z in OPENINGS:
+        on_wall = (ends[:, axis] - (ROOM[axis] if far else 0.0)).abs() < 1e-9
+        along, up = ends[:, 1 - axis], ends[:, 2]
+        inside = (along > u[0]) & (along < u[1]) & (up > z[0]) & (up < z[1])
+        ranges = ranges.masked_fill(on_wall & inside, torch.inf)
+    return ranges
+
+
+def _shell_mesh() -> trimesh.Trimesh:
+    """Walls without their openings, floor and ceiling, facing inward."""
+    import trimesh
+
+    quads = []
+    for axis in range(3):
+        u_axis, v_axis = (i for i in range(3) if i != axis)
+        for far in (False, True):
+            holes = [o for o in OPENINGS if (o.axis, o.far) == (axis, far)]
+            u_cuts = sorted({0.0, ROOM[u_axis], *(c for hole in holes for c in hole.u)})
+            v_cuts = sorted({0.0, ROOM[v_axis], *(c for hole in holes for c in hole.z)})
+            for u in zip(u_cuts, u_cuts[1:], strict=False):
+                for v in zip(v_cuts, v_cuts[1:], strict=False):
+                    if any(hole.u == u and hole.z == v for hole in holes):
+                        continue
+                    quad = np.full((4, 3), ROOM[axis] if far else 0.0)
+                    quad[:, u_axis] = [u[0], u[1], u[1], u[0]]
+                    quad[:, v_axis] = [v[0], v[0], v[1], v[1]]
+                    # u x v is +axis for x and z, -axis for y; inward is +axis at 0, -axis at ROOM
+                    quads.append(quad[::-1] if far != (axis == 1) else quad)
+    faces = np.concatenate([4 * i + np.array([[0, 1, 2], [0, 2, 3]]) for i in range(len(quads))])
+    return trimesh.Trimesh(np.concatenate(quads), faces, process=False)
