@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import tempfile
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,9 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"map file {path} does not exist")
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pickle protocols; the error below says enough
+            state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, zipfile.BadZipFile, ValueError,
             KeyError, IndexError, TypeError, AttributeError, OSError) as error:  # fmt: skip
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -58,7 +61,9 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
 def check_settings(extra: Any) -> dict[str, Any]:
     """The settings in a map's extra state, without the format version, or a ValueError."""
     if not isinstance(extra, dict) or not isinstance(extra.get("format_version"), int):
-        raise ValueError("_extra_state must hold the map's format version and settings; it does not")
+        raise ValueError(
+            "_extra_state must hold the map's format version and settings; it does not"
+        )
     settings = dict(extra)
     version = settings.pop("format_version")
     if version != FORMAT_VERSION:

@@ -163,6 +163,8 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     at a density of centers between that of the points and uniform, and starts near it.
     """
     ordered = points[z_order(points).argsort(stable=True)]
+    if num_clusters >= len(points):
+        return ordered
     lag = max(1, len(points) // (4 * num_clusters))
     gaps = torch.linalg.vector_norm(ordered[lag:] - ordered[:-lag], dim=1)
     ahead = torch.cat([gaps, gaps[-1:].expand(lag)])

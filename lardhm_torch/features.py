@@ -165,7 +165,11 @@ def feature_matrix(indices: Tensor, values: Tensor, num_clusters: int) -> Tensor
     rows = torch.arange(len(indices), device=indices.device)[:, None].expand_as(indices)
     coordinates = torch.stack([rows.reshape(-1), indices.reshape(-1)])
     return torch.sparse_coo_tensor(
-        coordinates, values.reshape(-1), (len(indices), num_clusters), is_coalesced=True
+        coordinates,
+        values.reshape(-1),
+        (len(indices), num_clusters),
+        is_coalesced=True,
+        check_invariants=False,
     )
 
 

@@ -125,7 +125,9 @@ def fit_weights(
             slope = batch_gradient(indices, values, labels[rows], factors[rows], weights)
             rate = config.learning_rate * (1 - step / total_steps if config.decay else 1.0)
             step += 1
-            weights, state = descend(weights, slope / len(rows), state, step, rate, len(labels), config)
+            weights, state = descend(
+                weights, slope / len(rows), state, step, rate, len(labels), config
+            )
     return weights
 
 

@@ -59,10 +59,9 @@ class LardHilbertMap(nn.Module):
         min_lengthscale: float = 0.01,
     ) -> None:
         super().__init__()
-        if dim < 1:
-            raise ValueError(f"dim must be 1 or more; got {dim}")
-        if num_neighbors < 1:
-            raise ValueError(f"num_neighbors must be 1 or more; got {num_neighbors}")
+        for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
         if not covariance_scale > 0 or not min_lengthscale > 0:
             raise ValueError(
                 "covariance_scale and min_lengthscale must be > 0; "
@@ -136,7 +135,9 @@ class LardHilbertMap(nn.Module):
                 f"got {tuple(points.shape)}"
             )
         # The origin is whole meters: exact in float32 too, so float32 points lose nothing.
-        working = torch.promote_types(torch.promote_types(points.dtype, self.centers.dtype), torch.float32)
+        working = torch.promote_types(
+            torch.promote_types(points.dtype, self.centers.dtype), torch.float32
+        )
         return (points.to(working) - self.origin.to(working)).to(self.centers.dtype)
 
     # --- how the map learns ---

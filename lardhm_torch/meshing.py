@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.features import lard_kernel, nearest_centers, squared_distances
-from lardhm_torch.querying import BLOCK_POINTS, cluster_boxes
+from lardhm_torch.features import nearest_centers
+from lardhm_torch.querying import BLOCK_POINTS, cluster_boxes, occupancy_gradient
 
 if TYPE_CHECKING:
     import trimesh
 
 BLOCK_CELLS = 24  # cells along a block's edge
-SUPPORT_NEIGHBORS = 8  # clusters looked at around a vertex
+MIN_SLOPE = 0.5  # change of log-odds over one standard deviation that makes a surface
 COLORS = ("height", "cluster", "probability")
 MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 
@@ -31,17 +31,20 @@ def extract_mesh(
     bounds: tuple[Any, Any] | None = None,
     *,
     color: str | None = "height",
-    support: float | None = 3.0,
+    min_slope: float = MIN_SLOPE,
     progress: bool = False,
 ) -> trimesh.Trimesh:
     """The surface on which the map's probability equals a threshold, normals into free space.
 
     Marching cubes on the log-odds, in blocks of which only those near a supporting cluster are
     evaluated. Supporting are the clusters that pull away from 1/2 to the threshold's side: positive
-    weights for a threshold of 1/2 or more, negative ones below. Where data ends, both classes' tails
-    vanish and log-odds wander around 0, so a level set at 1/2 has sheets there that nothing was
-    measured for: a face is kept only if its vertices lie within ``support`` standard deviations
-    (Mahalanobis) of a supporting cluster.
+    weights for a threshold of 1/2 or more, negative ones below.
+
+    Where data ends, both classes' tails vanish and log-odds wander around 0, so the level set at 1/2
+    has sheets there that nothing was measured for. They are told by their slope: a face is kept only
+    if, at its vertices, log-odds change by at least ``min_slope`` over one standard deviation of the
+    nearest supporting cluster (its smallest). A measured surface changes by several; the rule has
+    no unit and holds at every resolution.
 
     Args:
         model: a 3-D map.
@@ -50,7 +53,7 @@ def extract_mesh(
         bounds: lower and upper corner of the part to mesh, world frame [m]; left out: all of it.
         color: of the vertices: "height", "cluster" (one color for each nearest supporting
             cluster), "probability" (at the center of that cluster), or None.
-        support: Mahalanobis distance up to which a cluster supports a face; None keeps all faces.
+        min_slope: change of log-odds over one standard deviation at a surface; 0 keeps all faces.
         progress: show a progress bar.
 
     Returns:
@@ -61,7 +64,7 @@ def extract_mesh(
 
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
-    _check_meshing(model, resolution, threshold, color, support)
+    _check_meshing(model, resolution, threshold, color, min_slope)
     level = math.log(threshold / (1 - threshold))
     supporters = ((model.weights > 0) if level >= 0 else (model.weights < 0)).nonzero().squeeze(1)
     lower, upper = (box[supporters].cpu() for box in cluster_boxes(model))
@@ -76,9 +79,8 @@ def extract_mesh(
     blocks = _active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
     vertices, faces = _march_blocks(model, corner, resolution, blocks, cells, level, progress)
     world = vertices * resolution + corner.numpy()
-    nearest, closeness = _nearest_supporter(model, supporters, world)
-    if support is not None:
-        faces = faces[(closeness >= math.exp(-(support**2) / 2))[faces].all(axis=1)]
+    nearest, slope = _nearest_supporter(model, supporters, world)
+    faces = faces[(slope >= min_slope)[faces].all(axis=1)]
     mesh = _to_mesh(world, faces, _vertex_colors(model, world, nearest, color))
     mesh.remove_unreferenced_vertices()
     return mesh
@@ -103,7 +105,7 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
 
 
 def _check_meshing(
-    model: Any, resolution: float, threshold: float, color: str | None, support: float | None
+    model: Any, resolution: float, threshold: float, color: str | None, min_slope: float
 ) -> None:
     if model.dim != 3:
         raise ValueError(
@@ -117,8 +119,8 @@ def _check_meshing(
         raise ValueError(f"threshold must be between 0 and 1, both excluded; got {threshold}")
     if color is not None and color not in COLORS:
         raise ValueError(f"color must be one of {', '.join(COLORS)}, or None; got {color!r}")
-    if support is not None and not support > 0:
-        raise ValueError(f"support must be > 0 standard deviations, or None; got {support}")
+    if not min_slope >= 0:
+        raise ValueError(f"min_slope must be >= 0; got {min_slope}")
 
 
 def _active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
@@ -145,9 +147,7 @@ def _march_blocks(
     """Vertices (V, 3), in cells from the corner, and faces (F, 3) of all blocks, joined at seams."""
     from tqdm import tqdm
 
-    local = torch.stack(
-        torch.meshgrid(*[torch.arange(BLOCK_CELLS + 1)] * 3, indexing="ij"), dim=-1
-    )
+    local = torch.stack(torch.meshgrid(*[torch.arange(BLOCK_CELLS + 1)] * 3, indexing="ij"), dim=-1)
     parts, num_vertices = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))], 0
     batches = blocks.split(max(1, BLOCK_POINTS // local[..., 0].numel()))
     for batch in tqdm(batches, desc="mesh", disable=None if progress else True):
@@ -189,17 +189,17 @@ def _join(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _nearest_supporter(
     model: Any, supporters: Tensor, world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(V,) supporting cluster with the nearest center, and (V,) largest kernel value of any near."""
-    device, dtype = model.centers.device, model.centers.dtype
-    points = (torch.as_tensor(world, device=device) - model.origin).to(dtype)
-    centers, scale_tril = model.centers.detach()[supporters], model.scale_tril.detach()[supporters]
-    nearest, closeness = [], []
-    for chunk in points.split(BLOCK_POINTS // SUPPORT_NEIGHBORS):
-        indices = nearest_centers(chunk, centers, SUPPORT_NEIGHBORS)
-        closeness.append(lard_kernel(chunk, centers, scale_tril, indices).amax(dim=1))
-        gaps = squared_distances(chunk[:, None], centers[indices])
-        nearest.append(indices.gather(1, gaps.argmin(dim=1, keepdim=True)).squeeze(1))
-    return supporters[torch.cat(nearest)].cpu().numpy(), torch.cat(closeness).cpu().numpy()
+    """(V,) nearest supporting cluster, and (V,) change of log-odds over its standard deviation."""
+    points = torch.as_tensor(world, device=model.centers.device)
+    centers = model.centers.detach()[supporters]
+    thickness = torch.linalg.svdvals(model.scale_tril.detach()[supporters].double())[:, -1]
+    nearest, slopes = [], []
+    for chunk in points.split(BLOCK_POINTS // 4):
+        local = (chunk - model.origin).to(centers.dtype)
+        nearest.append(nearest_centers(local, centers, 1).squeeze(1))
+        gradient = occupancy_gradient(model, chunk)
+        slopes.append(torch.linalg.vector_norm(gradient, dim=1) * thickness[nearest[-1]])
+    return supporters[torch.cat(nearest)].cpu().numpy(), torch.cat(slopes).cpu().numpy()
 
 
 def _vertex_colors(

@@ -16,6 +16,7 @@ BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # how far a cluster reaches: exp(-3² / 2) = 1 % of its peak
 BISECTIONS = 16  # a step of 5 cm is narrowed down to below 1 µm
 STRIDE = 16  # steps of a ray evaluated together, before finished rays are set aside
+EVIDENCE = 0.5  # log-odds above the threshold that an obstacle must reach somewhere along the ray
 
 
 class Slice(NamedTuple):
@@ -105,7 +106,9 @@ def query_slice(
         ValueError: height is missing for a 3-D map or given for a 2-D one; another dimension.
     """
     if model.dim not in (2, 3):
-        raise ValueError(f"a slice needs a map of 2 or 3 dimensions; got {model.dim}. Use query_grid")
+        raise ValueError(
+            f"a slice needs a map of 2 or 3 dimensions; got {model.dim}. Use query_grid"
+        )
     if (height is None) != (model.dim == 2):
         raise ValueError(f"height must be a number in 3-D and None in 2-D; got {height}")
     lower, upper = map_bounds(model) if bounds is None else bounds
@@ -165,8 +168,10 @@ def raycast(
 ) -> Tensor:
     """Distance along each ray at which the probability first rises above a threshold.
 
-    The ray is sampled every ``step``, and the first stretch whose end is above the threshold is
-    narrowed down by bisection. A ray that starts above the threshold gives 0.
+    The ray is sampled every ``step`` until log-odds are clearly above the threshold, by 0.5; then
+    the place where they last crossed it is narrowed down by bisection. Without that margin the
+    ripple around 0 where nothing was measured would stop rays. A ray that starts clearly above the
+    threshold gives 0; one that starts in between is met where it gets clearly above.
 
     Args:
         model: the map.
@@ -216,32 +221,36 @@ def surface_step(model: Any) -> float:
 def _march(
     model: Any, origins: Tensor, directions: Tensor, max_range: float, level: float, step: float
 ) -> Tensor:
-    """(R,) first crossing of the level by each ray; finished rays leave the batch."""
-    found = origins.new_full((len(origins),), torch.inf)
-    low = torch.zeros_like(found)
+    """(R,) depth at which each ray meets the level; finished rays leave the batch."""
+    high = origins.new_full((len(origins),), torch.inf)  # first depth clearly above the level
+    low = torch.full_like(high, -1.0)  # last depth before it that is not above; -1: none yet
     active = torch.arange(len(origins), device=origins.device)
-    stride = step * torch.arange(STRIDE, device=origins.device, dtype=torch.float64)
-    start = 0.0
-    while len(active) and start <= max_range:
-        depths = (start + stride).clamp(max=max_range)
+    steps = torch.arange(STRIDE, device=origins.device)
+    start = 0
+    while len(active) and start * step <= max_range:
+        depths = ((start + steps).double() * step).clamp(max=max_range)
         points = origins[active, None] + depths[:, None] * directions[active, None]
-        above = model.log_odds(points) > level
-        first = above.to(torch.uint8).argmax(dim=1)
-        hit = above.any(dim=1)
-        found[active[hit]] = depths[first[hit]]
-        low[active[hit]] = (depths[first[hit]] - step).clamp(min=0.0)
+        log_odds = model.log_odds(points)
+        clear = log_odds > level + EVIDENCE
+        hit = clear.any(dim=1)
+        first = torch.where(hit, clear.to(torch.uint8).argmax(dim=1), STRIDE)
+        below = (log_odds <= level) & (steps < first[:, None])
+        last = torch.where(below, depths, -1.0).amax(dim=1)
+        low[active] = torch.maximum(low[active], last)
+        high[active[hit]] = depths[first[hit]]
         active = active[~hit]
-        start += STRIDE * step
-    hits = found.isfinite().nonzero().squeeze(1)
-    found[hits] = _bisect(model, origins[hits], directions[hits], low[hits], found[hits], level)
-    return found
+        start += STRIDE
+    hits = high.isfinite().nonzero().squeeze(1)
+    target = torch.where(low[hits] < 0, level + EVIDENCE, level)
+    low = torch.where(low < 0, (high - step).clamp(min=0.0), low)
+    high[hits] = _bisect(model, origins[hits], directions[hits], low[hits], high[hits], target)
+    return high
 
 
 def _bisect(
-    model: Any, origins: Tensor, directions: Tensor, low: Tensor, high: Tensor, level: float
+    model: Any, origins: Tensor, directions: Tensor, low: Tensor, high: Tensor, level: Tensor
 ) -> Tensor:
     """(R,) depths between low, where log-odds are not above the level, and high, where they are."""
-    high = torch.where(high == 0, low, high)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         above = model.log_odds(origins + middle[:, None] * directions) > level

@@ -23,7 +23,7 @@ class SamplingConfig:
     max_range: float = 100.0  # [m] beyond it a ray is cut and has no hit
     free_spacing: float = 1.0  # [m] one free sample for every such stretch of a ray
     near_samples: int = 1  # free samples close in front of each hit
-    near_margin: float = 0.1  # [m] no free sample is closer to its own hit
+    near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
 
     def __post_init__(self) -> None:

@@ -115,9 +115,7 @@ class Scans:
                 raise ValueError(
                     f"the last coordinate must be constant to be dropped; it spans {spread:.3g} m"
                 )
-        return Scans(
-            origins[:, :-1], ends[:, :-1], self.scan_id, self.is_return, self.target_index
-        )
+        return Scans(origins[:, :-1], ends[:, :-1], self.scan_id, self.is_return, self.target_index)
 
 
 def concatenate_scans(parts: list[Scans]) -> Scans:

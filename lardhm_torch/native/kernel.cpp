@@ -210,7 +210,10 @@ void run_tasks(int64_t tasks, const Work& work) {
 
 constexpr uint64_t kMagic = 0x3178656d6864724cULL;
 constexpr int kBlock = 32;          // centers in a block of the pruned search
-constexpr int kTarget = 28;         // a leaf with at most this many candidates is not split
+#ifndef TARGET
+#define TARGET 28
+#endif
+constexpr int kTarget = TARGET;         // a leaf with at most this many candidates is not split
 constexpr int kLongList = 192;      // leaves with more candidates use the pruned search
 constexpr int kFinestBits = 20;     // cells along an axis at the finest level: 2^20
 constexpr int32_t kUnset = std::numeric_limits<int32_t>::max();
@@ -644,7 +647,7 @@ struct IndexBuilder {
 
   // The upper levels on one thread, then each of their cells as a part of its own.
   void grow_tree() {
-    const int64_t budget = std::max<int64_t>(int64_t(1) << 18, 8 * header.count);
+    const int64_t budget = std::max<int64_t>(int64_t(1) << 20, 512 * header.count);
     TreeBuilder<D> tree{relative.data(), padded(header.count), header,
                         TreeBuilder<D>::bound_for(header.k), budget};
     std::vector<std::pair<Cell, std::vector<int32_t>>> cells(1);

@@ -1,0 +1,37 @@
+# make demo   set-up and the main job: simulate a room, fit a map, evaluate it, draw it (out/)
+# make test   set-up, checks and tests
+# make bench  set-up and the benchmarks (minutes)
+# make soak   set-up and the long checks: fuzzing, kills (tens of minutes)
+
+PYTHON ?= python3
+BIN := .venv/bin
+export MPLBACKEND := Agg
+
+.PHONY: demo test bench soak docs
+.DELETE_ON_ERROR:
+
+.venv/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+		$(shell grep -o '^torch==[^ ]*' constraints.txt) -e '.[dev]'
+	touch $@
+
+.venv/bench: .venv/ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	touch $@
+
+demo: .venv/ready
+	$(BIN)/python scripts/demo.py out
+
+test: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+bench: .venv/bench
+	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/accuracy.py
+
+soak: .venv/ready
+	$(BIN)/python scripts/fuzz_readers.py

@@ -1,0 +1,255 @@
+"""The command `lardhm`: one verb for each thing a map is for."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lardhm_torch.scans import Scans
+
+# torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one verb; 0, or 1 after a one-line error, or 2 for a wrong command line."""
+    arguments = _parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"lardhm {arguments.verb}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"lardhm {arguments.verb}: interrupted; nothing was written", file=sys.stderr)
+        return 130
+    return 0
+
+
+def simulate(arguments: argparse.Namespace) -> None:
+    """Scans of the simulated room to a file."""
+    from lardhm_torch import save_scans, simulate_room
+
+    scans = simulate_room(num_rays=arguments.rays, seed=arguments.seed)
+    save_scans(scans, arguments.output)
+    print(f"{len(scans)} rays of {scans.num_scans} scans -> {arguments.output}")
+
+
+def split(arguments: argparse.Namespace) -> None:
+    """Whole rays to a training and a test file."""
+    from lardhm_torch import save_scans, split_rays
+
+    parts = split_rays(_load_scans(arguments), arguments.ratio, arguments.seed)
+    for part, path in zip(parts, arguments.output, strict=True):
+        save_scans(part, path)
+        print(f"{len(part)} rays -> {path}")
+
+
+def fit(arguments: argparse.Namespace) -> None:
+    """Scans to a map."""
+    from lardhm_torch import LardHilbertMap, sample_rays
+
+    scans = _load_scans(arguments)
+    samples = sample_rays(scans, seed=arguments.seed)
+    _report_dropped(samples.dropped)
+    settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
+    model = LardHilbertMap(scans.dim, **settings)
+    model.fit(
+        samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True
+    )
+    model.save(arguments.output)
+    hits = int(samples.labels.sum())
+    print(
+        f"{hits} hits and {len(samples) - hits} free points -> {len(model)} clusters "
+        f"-> {arguments.output}"
+    )
+
+
+def query(arguments: argparse.Namespace) -> None:
+    """Points to probabilities, in the order of the points."""
+    import numpy as np
+    import torch
+
+    from lardhm_torch import LardHilbertMap
+    from lardhm_torch.io import load_points
+
+    model = LardHilbertMap.load(arguments.map)
+    with torch.no_grad():
+        probability = model(load_points(arguments.points)).float().numpy()
+    _write_atomically(arguments.output, lambda file: np.save(file, probability))
+    print(f"{len(probability)} probabilities -> {arguments.output}")
+
+
+def mesh(arguments: argparse.Namespace) -> None:
+    """A map to a surface."""
+    from lardhm_torch import LardHilbertMap, extract_mesh
+    from lardhm_torch.meshing import save_mesh
+
+    surface = extract_mesh(
+        LardHilbertMap.load(arguments.map),
+        arguments.resolution,
+        arguments.threshold,
+        color=arguments.color,
+        progress=True,
+    )
+    save_mesh(surface, arguments.output)
+    print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
+
+
+def evaluate(arguments: argparse.Namespace) -> None:
+    """A map against held-out rays."""
+    from lardhm_torch import LardHilbertMap
+    from lardhm_torch.metrics import evaluate as evaluate_map
+    from lardhm_torch.metrics import format_metrics
+
+    model = LardHilbertMap.load(arguments.map)
+    table = evaluate_map(model, _load_scans(arguments, model.dim), seed=arguments.seed)
+    print(json.dumps(table, indent=2) if arguments.json else format_metrics(table))
+
+
+def info(arguments: argparse.Namespace) -> None:
+    """What a map file holds."""
+    from lardhm_torch import LardHilbertMap
+    from lardhm_torch.querying import map_bounds
+
+    model = LardHilbertMap.load(arguments.map)
+    occupied = int(model.is_occupied.sum())
+    rows: dict[str, Any] = {
+        "file size [bytes]": Path(arguments.map).stat().st_size,
+        **model.settings,
+        "dtype": str(model.centers.dtype).removeprefix("torch."),
+        "clusters": len(model),
+        "occupied clusters": occupied,
+        "free clusters": len(model) - occupied,
+        "training points": int(model.counts.sum()),
+        "origin [m]": model.origin.tolist(),
+    }
+    if len(model):
+        lower, upper = map_bounds(model)
+        rows["bounds [m]"] = [[round(float(v), 3) for v in corner] for corner in (lower, upper)]
+    if arguments.json:
+        print(json.dumps(rows, indent=2))
+        return
+    for name, value in rows.items():
+        print(f"{name:<22}{value}")
+
+
+def _load_scans(arguments: argparse.Namespace, dim: int | None = None) -> Scans:
+    """The scans named on the command line, without z where ``--dim 2`` or a 2-D map asks for it."""
+    from lardhm_torch import load_scans
+
+    scans = load_scans(arguments.scans, origin=getattr(arguments, "origin", None))
+    dim = getattr(arguments, "dim", None) or dim or scans.dim
+    if dim == scans.dim - 1:
+        return scans.drop_constant_column()
+    if dim != scans.dim:
+        raise ValueError(f"scans must have {dim} coordinates; got {scans.dim}")
+    return scans
+
+
+def _report_dropped(dropped: dict[str, int]) -> None:
+    for reason, count in dropped.items():
+        if count:
+            print(f"{count} rays {reason}", file=sys.stderr)
+
+
+def _write_atomically(path: str, write: Any) -> None:
+    target = Path(path)
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            write(file)
+        os.chmod(name, 0o644)
+        os.replace(name, target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="lardhm",
+        description="Continuous, probabilistic maps of occupancy from range scans.",
+        epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las.",
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(run: Any, **defaults: Any) -> argparse.ArgumentParser:
+        sub = verbs.add_parser(run.__name__, help=run.__doc__, description=run.__doc__)
+        sub.set_defaults(run=run, **defaults)
+        return sub
+
+    _scan_verbs(verb)
+    _map_verbs(verb)
+    return parser
+
+
+def _scan_verbs(verb: Any) -> None:
+    sub = verb(simulate)
+    _output(sub)
+    sub.add_argument("--rays", type=int, default=50_000, help="number of rays (50000)")
+    _seed(sub)
+
+    sub = verb(split)
+    _scans(sub)
+    sub.add_argument("--ratio", type=float, default=0.5, help="share that trains (0.5)")
+    _seed(sub)
+    sub.add_argument("-o", "--output", nargs=2, required=True, metavar=("TRAIN", "TEST"))
+
+    sub = verb(fit)
+    _scans(sub)
+    _output(sub)
+    sub.add_argument("--clusters", type=int, help="total number (chosen from the data)")
+    sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
+    sub.add_argument("--dim", type=int, help="2 drops a constant last column")
+    _seed(sub)
+
+
+def _map_verbs(verb: Any) -> None:
+    sub = verb(query)
+    sub.add_argument("map")
+    sub.add_argument("points", help=".npy or .npz of (N, D), or any scan file")
+    _output(sub)
+
+    sub = verb(mesh)
+    sub.add_argument("map")
+    _output(sub)
+    sub.add_argument("--resolution", type=float, default=0.05, help="lattice cell [m] (0.05)")
+    sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
+    sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
+
+    sub = verb(evaluate)
+    sub.add_argument("map")
+    _scans(sub)
+    sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    _seed(sub)
+
+    sub = verb(info)
+    sub.add_argument("map")
+    sub.add_argument("--json", action="store_true", help="print JSON instead of lines")
+
+
+def _scans(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("scans", nargs="+", metavar="SCANS")
+    sub.add_argument(
+        "--origin",
+        type=lambda text: tuple(float(part) for part in text.split(",")),
+        metavar="X,Y,Z",
+        help="sensor position of files that do not tell it",
+    )
+
+
+def _output(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("-o", "--output", required=True, metavar="FILE")
+
+
+def _seed(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.cluster import MiniBatchKMeans
+
+from lardhm_torch.clustering import (
+    cluster_classes,
+    cluster_moments,
+    cluster_points,
+    factor_covariances,
+    merge_small,
+    mini_batch_kmeans,
+    pool_clusters,
+    split_clusters,
+)
+from lardhm_torch.features import nearest_centers, squared_distances
+
+F64 = torch.float64
+
+
+def rng(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def blobs(count=20, each=100, dim=3, seed=0):
+    centers = torch.rand(count, dim, generator=rng(seed), dtype=F64) * 10
+    noise = torch.randn(count, each, dim, generator=rng(seed), dtype=F64) * 0.2
+    return (centers[:, None] + noise).reshape(-1, dim)
+
+
+def inertia(points, centers):
+    nearest = nearest_centers(points, centers, 1).squeeze(1)
+    return float(squared_distances(points, centers[nearest]).sum())
+
+
+def test_moments_equal_numpy_cluster_by_cluster():
+    points = torch.randn(300, 3, dtype=F64)
+    labels = torch.randint(7, (300,))
+    clusters = cluster_moments(points, labels, 7)
+    for m in range(7):
+        members = points[labels == m].numpy()
+        assert clusters.counts[m] == len(members)
+        np.testing.assert_allclose(clusters.means[m], members.mean(axis=0))
+        np.testing.assert_allclose(clusters.covariances[m], np.cov(members.T), atol=1e-12)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**31 - 1), dim=st.integers(1, 5), groups=st.integers(1, 9))
+def test_pooling_equals_the_moments_of_the_union(seed, dim, groups):
+    points = torch.randn(200, dim, generator=rng(seed), dtype=F64) + 100
+    labels = torch.randint(10, (200,), generator=rng(seed))
+    group_of = torch.randint(groups, (10,), generator=rng(seed))
+    pooled = pool_clusters(cluster_moments(points, labels, 10), group_of, groups)
+    union = cluster_moments(points, group_of[labels], groups)
+    assert torch.equal(pooled.counts, union.counts)
+    filled = union.counts > 0
+    torch.testing.assert_close(pooled.means[filled], union.means[filled])
+    torch.testing.assert_close(
+        pooled.scatters[filled], union.scatters[filled], atol=1e-9, rtol=1e-9
+    )
+
+
+def test_every_point_belongs_to_one_cluster_and_none_is_small():
+    points = blobs()
+    clusters = cluster_points(points, 60, rng())
+    assert clusters.counts.sum() == len(points)
+    assert clusters.counts.min() >= 5
+    assert 30 <= len(clusters) <= 60
+
+
+def test_small_clusters_join_their_nearest_neighbor():
+    points = torch.tensor([[0.0]] * 5 + [[1.0]] * 2 + [[10.0]] * 6, dtype=F64)
+    labels = torch.tensor([0] * 5 + [1] * 2 + [3] * 6)
+    merged = merge_small(cluster_moments(points, labels, 4))
+    assert merged.counts.tolist() == [7, 6]
+    torch.testing.assert_close(merged.means[0], points[:7].mean(dim=0))
+
+
+def test_where_all_clusters_are_small_one_remains():
+    merged = merge_small(cluster_moments(torch.randn(3, 2), torch.arange(3), 3))
+    assert merged.counts.tolist() == [3]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_inertia_is_no_worse_than_scikit_learns(seed):
+    points = torch.rand(8000, 3, generator=rng(seed)) ** 2  # uneven density
+    ours = inertia(points, mini_batch_kmeans(points, 100, rng(seed)))
+    theirs = MiniBatchKMeans(100, random_state=seed, n_init=3).fit(points.numpy())
+    assert ours <= 1.02 * inertia(points, torch.tensor(theirs.cluster_centers_))
+
+
+def test_the_same_seed_gives_the_same_centers():
+    points = blobs()
+    first, again = (mini_batch_kmeans(points, 30, rng(5)) for _ in range(2))
+    assert torch.equal(first, again)
+
+
+def test_clusters_move_with_the_points():
+    points, shift = blobs(), 2.0**12  # exact in float64: the same random choices
+    here = cluster_points(points, 30, rng())
+    there = cluster_points(points + shift, 30, rng())
+    torch.testing.assert_close(there.means - shift, here.means, atol=1e-8, rtol=0)
+    torch.testing.assert_close(there.scatters, here.scatters, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        torch.zeros(1, 3, dtype=F64),
+        torch.ones(100, 3, dtype=F64),
+        torch.linspace(0, 9, 100, dtype=F64)[:, None] * torch.tensor([1.0, 0, 0]),
+        torch.rand(100, 3, dtype=F64) * torch.tensor([1.0, 1.0, 0.0]),
+        (torch.rand(100, 3) * torch.tensor([1e3, 1e3, 1e-6])).float(),
+    ],
+    ids=["one point", "all equal", "a line", "a plane", "a wide thin plane in float32"],
+)
+def test_degenerate_clusters_get_a_valid_factor(points):
+    clusters = cluster_points(points, 4, rng())
+    factors = factor_covariances(clusters.covariances, 0.01)
+    assert factors.isfinite().all()
+    assert (factors.diagonal(dim1=-2, dim2=-1) >= 0.01 * (1 - 1e-6)).all()
+
+
+def test_factors_reproduce_the_covariance_plus_floor():
+    covariances = cluster_points(blobs(), 10, rng()).covariances
+    factors = factor_covariances(covariances, 0.05)
+    expected = covariances + 0.05**2 * torch.eye(3, dtype=F64)
+    torch.testing.assert_close(factors @ factors.mT, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_classes_are_clustered_apart_occupied_first():
+    points = blobs()
+    labels = (points[:, 0] > 5).double()
+    clusters, is_occupied = cluster_classes(points, labels, 40, rng())
+    assert torch.equal(is_occupied, clusters.means[:, 0] > 5)
+    assert is_occupied.long().diff().max() <= 0
+    assert clusters.counts[is_occupied].sum() == labels.sum()
+
+
+@pytest.mark.parametrize(
+    ("sizes", "asked", "given_out"),
+    [
+        ([1000, 1000], 101, [51, 50]),
+        ([1000, 20], 100, [96, 4]),
+        ([20, 1000], 100, [4, 96]),
+        ([1000, 0], 100, [100, 0]),
+        ([3, 3], 500, [1, 1]),
+        ([1000, 8000], None, [50, 50]),
+        ([0, 400], None, [0, 20]),
+        ([10**7, 10**8], None, [3000, 3000]),
+    ],
+)
+def test_clusters_are_split_over_the_classes(sizes, asked, given_out):
+    assert split_clusters(sizes, asked) == given_out

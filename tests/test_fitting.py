@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+import torch
+from sklearn.linear_model import LogisticRegression
+
+from lardhm_torch.fitting import (
+    FitConfig,
+    balance_classes,
+    batch_gradient,
+    fit_weights,
+    keep_features,
+    logistic_loss,
+)
+
+F64 = torch.float64
+
+
+def problem(points=600, clusters=12, seed=0, share=0.3):
+    """Overlapping classes with K = 3 features a point."""
+    rng = torch.Generator().manual_seed(seed)
+    indices = torch.rand(points, clusters, generator=rng).topk(3).indices.sort(dim=1).values
+    values = torch.rand(points, 3, generator=rng, dtype=F64)
+    truth = torch.randn(clusters, generator=rng, dtype=F64) * 2
+    logit = (values * truth[indices]).sum(dim=1) + np.log(share / (1 - share))
+    labels = (torch.rand(points, generator=rng, dtype=F64) < torch.sigmoid(logit)).to(F64)
+    return indices, values, labels
+
+
+def dense(indices, values, clusters):
+    return torch.zeros(len(indices), clusters, dtype=F64).scatter_(1, indices, values)
+
+
+def fit(indices, values, labels, clusters, **settings):
+    config = FitConfig(**settings)
+    rng = torch.Generator().manual_seed(0)
+    start = torch.zeros(clusters, dtype=F64)
+    return fit_weights(lambda r: (indices[r], values[r]), labels, start, config, rng)
+
+
+@pytest.mark.parametrize("balance", [True, False])
+def test_weights_reach_scikit_learns_optimum(balance):
+    indices, values, labels = problem()
+    ours = fit(indices, values, labels, 12, passes=600, batch_size=600, l2=0.5, balance=balance)
+    exact = LogisticRegression(
+        C=1.0, fit_intercept=False, class_weight="balanced" if balance else None, tol=1e-10
+    ).fit(dense(indices, values, 12), labels)
+    np.testing.assert_allclose(ours, exact.coef_[0], atol=2e-3)
+
+
+def test_l1_reaches_scikit_learns_optimum_and_makes_weights_exactly_zero():
+    indices, values, labels = problem()
+    ours = fit(
+        indices, values, labels, 12, passes=800, batch_size=600, l2=0.0, l1=12.0, balance=False
+    )
+    exact = LogisticRegression(
+        C=1 / 12.0, l1_ratio=1.0, solver="saga", fit_intercept=False, tol=1e-8, max_iter=20000
+    ).fit(dense(indices, values, 12), labels)
+    np.testing.assert_allclose(ours, exact.coef_[0], atol=2e-2)
+    assert torch.equal(ours == 0, torch.as_tensor(exact.coef_[0] == 0))
+    assert (ours == 0).any()
+
+
+def test_the_papers_sgd_is_one_step_a_point_against_the_gradient():
+    indices, values, labels = problem(points=5, clusters=4)
+    paper = {"passes": 1, "batch_size": 1, "learning_rate": 0.1, "decay": False}
+    ours = fit(indices, values, labels, 4, **paper, preconditioner=False, l2=0, balance=False)
+    weights = torch.zeros(4, dtype=F64)
+    order = torch.randperm(5, generator=torch.Generator().manual_seed(0))
+    for row in order:
+        phi = dense(indices[row : row + 1], values[row : row + 1], 4)[0]
+        weights = weights - 0.1 * (torch.sigmoid(phi @ weights) - labels[row]) * phi
+    torch.testing.assert_close(ours, weights)
+
+
+def test_the_gradient_equals_autograd():
+    indices, values, labels = problem()
+    weights = torch.randn(12, dtype=F64, requires_grad=True)
+    factors = balance_classes(labels)
+    logistic_loss((values * weights[indices]).sum(dim=1), labels, factors).backward()
+    ours = batch_gradient(indices, values, labels, factors, weights.detach())
+    torch.testing.assert_close(ours, weights.grad)
+
+
+def test_the_default_is_within_a_percent_of_the_optimum():
+    indices, values, labels = problem(points=20000, clusters=200)
+    factors = balance_classes(labels)
+
+    def loss(weights):
+        return float(logistic_loss((values * weights[indices]).sum(dim=1), labels, factors))
+
+    default = loss(fit(indices, values, labels, 200))
+    assert default <= 1.01 * loss(fit(indices, values, labels, 200, passes=100))
+
+
+def test_both_classes_weigh_the_same_however_rare_one_is():
+    labels = torch.tensor([1.0] + [0.0] * 16)
+    factors = balance_classes(labels)
+    torch.testing.assert_close(factors[labels == 1].sum(), factors[labels == 0].sum())
+    torch.testing.assert_close(factors.mean(), torch.tensor(1.0))
+    assert torch.equal(balance_classes(torch.ones(4)), torch.ones(4))
+
+
+def test_the_start_is_left_alone_and_the_seed_decides():
+    indices, values, labels = problem()
+    start = torch.ones(12, dtype=F64)
+    runs = [
+        fit_weights(
+            lambda r: (indices[r], values[r]),
+            labels, start, FitConfig(), torch.Generator().manual_seed(seed),
+        )
+        for seed in (1, 1, 2)
+    ]  # fmt: skip
+    assert torch.equal(start, torch.ones(12, dtype=F64))
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0], runs[2])
+
+
+def test_kept_features_are_the_same_and_computed_once():
+    indices, values, _ = problem()
+    calls = []
+
+    def features_of(rows):
+        calls.append(len(rows))
+        return indices[rows], values[rows]
+
+    kept = keep_features(features_of, 600, 1 << 20, indices.device)
+    rows = torch.randint(600, (50,))
+    before = len(calls)
+    assert torch.equal(kept(rows)[1], values[rows])
+    assert len(calls) == before
+    assert keep_features(features_of, 600, 100, indices.device) is features_of
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"passes": 0}, "passes must be 1 or more; got 0"),
+        ({"batch_size": 0}, "batch_size must be 1 or more; got 0"),
+        ({"learning_rate": 0.0}, "learning_rate must be > 0; got 0"),
+        ({"l1": -1.0}, "l1 and l2 must be 0 or more; got -1"),
+    ],
+)
+def test_settings_are_checked_when_made(settings, message):
+    with pytest.raises(ValueError, match=message):
+        FitConfig(**settings)
