@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.features import nearest_centers
-from lardhm_torch.querying import BLOCK_POINTS, cluster_boxes, occupancy_gradient
+from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, cluster_boxes, grid_axes
 
 if TYPE_CHECKING:
     import trimesh
 
 BLOCK_CELLS = 24  # cells along a block's edge
-MIN_SLOPE = 0.5  # change of log-odds over one standard deviation that makes a surface
+CHUNK_VERTICES = 1 << 18  # vertices probed at a time
+PROBES = (1.0, 2.0, 3.0)  # standard deviations before and behind a face where evidence is sought
 COLORS = ("height", "cluster", "probability")
 MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 
@@ -31,7 +32,7 @@ def extract_mesh(
     bounds: tuple[Any, Any] | None = None,
     *,
     color: str | None = "height",
-    min_slope: float = MIN_SLOPE,
+    evidence: float | None = EVIDENCE,
     progress: bool = False,
 ) -> trimesh.Trimesh:
     """The surface on which the map's probability equals a threshold, normals into free space.
@@ -41,10 +42,10 @@ def extract_mesh(
     weights for a threshold of 1/2 or more, negative ones below.
 
     Where data ends, both classes' tails vanish and log-odds wander around 0, so the level set at 1/2
-    has sheets there that nothing was measured for. They are told by their slope: a face is kept only
-    if, at its vertices, log-odds change by at least ``min_slope`` over one standard deviation of the
-    nearest supporting cluster (its smallest). A measured surface changes by several; the rule has
-    no unit and holds at every resolution.
+    has sheets there, and backs of walls, that nothing was measured for. A face is kept only if the
+    map is sure on both sides of it: within three standard deviations of the nearest supporting
+    cluster (its smallest), log-odds exceed the threshold's by ``evidence`` behind each vertex and
+    fall short of it by as much in front. The rule has no unit and holds at every resolution.
 
     Args:
         model: a 3-D map.
@@ -53,7 +54,7 @@ def extract_mesh(
         bounds: lower and upper corner of the part to mesh, world frame [m]; left out: all of it.
         color: of the vertices: "height", "cluster" (one color for each nearest supporting
             cluster), "probability" (at the center of that cluster), or None.
-        min_slope: change of log-odds over one standard deviation at a surface; 0 keeps all faces.
+        evidence: log-odds on both sides of a face, see above; None keeps all faces.
         progress: show a progress bar.
 
     Returns:
@@ -64,24 +65,28 @@ def extract_mesh(
 
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
-    _check_meshing(model, resolution, threshold, color, min_slope)
+    _check_meshing(model, resolution, threshold, color, evidence)
     level = math.log(threshold / (1 - threshold))
     supporters = ((model.weights > 0) if level >= 0 else (model.weights < 0)).nonzero().squeeze(1)
     lower, upper = (box[supporters].cpu() for box in cluster_boxes(model))
     if bounds is not None:
-        start, end = (torch.as_tensor(b, dtype=torch.float64).cpu() for b in bounds)
-        touching = ((upper >= start) & (lower <= end)).all(dim=1)
-        lower, upper = lower[touching].maximum(start), upper[touching].minimum(end)
+        corner, end = (torch.as_tensor(b, dtype=torch.float64).cpu() for b in bounds)
+        grid_axes(corner, end, resolution)  # raises what is wrong with them
+        touching = ((upper >= corner) & (lower <= end)).all(dim=1)
+        lower, upper = lower[touching].maximum(corner), upper[touching].minimum(end)
     if len(lower) == 0:
         return _to_mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    corner = lower.amin(dim=0) if bounds is None else start
-    cells = ((upper.amax(dim=0) - corner) / resolution + 1e-6).floor().long().clamp(min=1)
+    if bounds is None:
+        corner, end = lower.amin(dim=0), upper.amax(dim=0)
+    cells = ((end - corner) / resolution + 1e-6).floor().long().clamp(min=1)
     blocks = _active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
     vertices, faces = _march_blocks(model, corner, resolution, blocks, cells, level, progress)
     world = vertices * resolution + corner.numpy()
-    nearest, slope = _nearest_supporter(model, supporters, world)
-    faces = faces[(slope >= min_slope)[faces].all(axis=1)]
+    nearest = _nearest_supporters(model, supporters, world)
     mesh = _to_mesh(world, faces, _vertex_colors(model, world, nearest, color))
+    if evidence is not None:
+        seen = _has_evidence(model, mesh, nearest, level, evidence)
+        mesh.update_faces(seen[faces].all(axis=1))
     mesh.remove_unreferenced_vertices()
     return mesh
 
@@ -105,7 +110,7 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
 
 
 def _check_meshing(
-    model: Any, resolution: float, threshold: float, color: str | None, min_slope: float
+    model: Any, resolution: float, threshold: float, color: str | None, evidence: float | None
 ) -> None:
     if model.dim != 3:
         raise ValueError(
@@ -119,8 +124,8 @@ def _check_meshing(
         raise ValueError(f"threshold must be between 0 and 1, both excluded; got {threshold}")
     if color is not None and color not in COLORS:
         raise ValueError(f"color must be one of {', '.join(COLORS)}, or None; got {color!r}")
-    if not min_slope >= 0:
-        raise ValueError(f"min_slope must be >= 0; got {min_slope}")
+    if evidence is not None and not evidence >= 0:
+        raise ValueError(f"evidence must be >= 0, or None to keep all faces; got {evidence}")
 
 
 def _active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
@@ -186,20 +191,33 @@ def _join(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return unique, faces[~collapsed]
 
 
-def _nearest_supporter(
-    model: Any, supporters: Tensor, world: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(V,) nearest supporting cluster, and (V,) change of log-odds over its standard deviation."""
-    points = torch.as_tensor(world, device=model.centers.device)
+def _nearest_supporters(model: Any, supporters: Tensor, world: np.ndarray) -> np.ndarray:
+    """(V,) supporting cluster with the nearest center."""
     centers = model.centers.detach()[supporters]
-    thickness = torch.linalg.svdvals(model.scale_tril.detach()[supporters].double())[:, -1]
-    nearest, slopes = [], []
-    for chunk in points.split(BLOCK_POINTS // 4):
-        local = (chunk - model.origin).to(centers.dtype)
-        nearest.append(nearest_centers(local, centers, 1).squeeze(1))
-        gradient = occupancy_gradient(model, chunk)
-        slopes.append(torch.linalg.vector_norm(gradient, dim=1) * thickness[nearest[-1]])
-    return supporters[torch.cat(nearest)].cpu().numpy(), torch.cat(slopes).cpu().numpy()
+    points = torch.as_tensor(world, device=centers.device) - model.origin
+    nearest = nearest_centers(points.to(centers.dtype), centers, 1).squeeze(1)
+    return supporters[nearest].cpu().numpy()
+
+
+@torch.no_grad()
+def _has_evidence(
+    model: Any, mesh: trimesh.Trimesh, nearest: np.ndarray, level: float, evidence: float
+) -> np.ndarray:
+    """(V,) whether log-odds are clearly above the level behind a vertex and clearly below in front."""
+    device = model.centers.device
+    thickness = torch.linalg.svdvals(model.scale_tril.double())[:, -1]
+    vertices = torch.as_tensor(np.array(mesh.vertices), device=device)
+    normals = torch.as_tensor(np.array(mesh.vertex_normals), device=device)
+    steps = normals * thickness[torch.as_tensor(nearest, device=device), None]
+    depths = torch.tensor(PROBES, dtype=torch.float64, device=device)[:, None, None]
+    result = []
+    for start, step in zip(
+        vertices.split(CHUNK_VERTICES), steps.split(CHUNK_VERTICES), strict=True
+    ):
+        in_front = model.log_odds(start + depths * step).amin(dim=0)
+        behind = model.log_odds(start - depths * step).amax(dim=0)
+        result.append((in_front < level - evidence) & (behind > level + evidence))
+    return torch.cat(result).cpu().numpy()
 
 
 def _vertex_colors(

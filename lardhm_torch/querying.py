@@ -16,7 +16,7 @@ BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # how far a cluster reaches: exp(-3² / 2) = 1 % of its peak
 BISECTIONS = 16  # a step of 5 cm is narrowed down to below 1 µm
 STRIDE = 16  # steps of a ray evaluated together, before finished rays are set aside
-EVIDENCE = 0.5  # log-odds above the threshold that an obstacle must reach somewhere along the ray
+EVIDENCE = 1.0  # log-odds beyond the threshold that something measured reaches; ripple does not
 
 
 class Slice(NamedTuple):
@@ -113,9 +113,10 @@ def query_slice(
         raise ValueError(f"height must be a number in 3-D and None in 2-D; got {height}")
     lower, upper = map_bounds(model) if bounds is None else bounds
     level = [] if height is None else [float(height)]
-    corners = [[*torch.as_tensor(corner).tolist()[:2], *level] for corner in (lower, upper)]
-    axes = grid_axes(*corners, resolution)
-    probability = query_grid(model, *corners, resolution).reshape(len(axes[0]), len(axes[1]))
+    lower, upper = ([*torch.as_tensor(end).tolist()[:2], *level] for end in (lower, upper))
+    axes = grid_axes(lower, upper, resolution)
+    probability = query_grid(model, lower, upper, resolution)
+    probability = probability.reshape(len(axes[0]), len(axes[1]))
     x_first, x_last, y_first, y_last = (float(axes[i][j]) for i in (0, 1) for j in (0, -1))
     return Slice(probability, (x_first, x_last, y_first, y_last))
 
@@ -168,7 +169,7 @@ def raycast(
 ) -> Tensor:
     """Distance along each ray at which the probability first rises above a threshold.
 
-    The ray is sampled every ``step`` until log-odds are clearly above the threshold, by 0.5; then
+    The ray is sampled every ``step`` until log-odds are clearly above the threshold, by 1; then
     the place where they last crossed it is narrowed down by bisection. Without that margin the
     ripple around 0 where nothing was measured would stop rays. A ray that starts clearly above the
     threshold gives 0; one that starts in between is met where it gets clearly above.
@@ -194,7 +195,7 @@ def raycast(
     directions = directions.to(device, torch.float64)
     directions = directions / torch.linalg.vector_norm(directions, dim=1, keepdim=True)
     origins = origins.to(device, torch.float64).expand_as(directions)
-    step = min(step or surface_step(model), max_range)
+    step = min(surface_step(model) if step is None else step, max_range)
     level = math.log(threshold / (1 - threshold))
     rays_at_once = max(1, BLOCK_POINTS // STRIDE)
     parts = [

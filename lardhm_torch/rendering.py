@@ -32,6 +32,7 @@ def render_mesh(
     size: tuple[int, int] = (1200, 900),
     zoom: float = 1.0,
     cut_above: float | None = None,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     cull: bool = True,
 ) -> np.ndarray:
     """A picture of a mesh: perspective, smooth shading, darker in corners, white background.
@@ -42,29 +43,34 @@ def render_mesh(
     Args:
         mesh: with vertex colors or without.
         path: where to write a PNG; None writes nothing.
-        azimuth: direction from the scene to the camera, from +x toward +y [degrees].
+        azimuth: direction from the scene to the camera, counterclockwise seen from above, from +x
+            (or from +y, if x is up) [degrees].
         elevation: of the camera above the horizon [degrees].
         size: width and height [pixels].
         zoom: above 1 for a closer view of the middle.
-        cut_above: faces that reach above this z are left out, such as a ceiling [m].
+        cut_above: faces that reach higher than this along ``up`` are left out, such as a ceiling [m].
+        up: direction that points up in the picture; (0, -1, 0) in the frame of a camera.
         cull: leave out faces seen from behind, so that walls do not hide the room behind them.
 
     Returns:
         (height, width, 3) uint8 RGB.
 
     Raises:
-        ValueError: size or zoom is not > 0, or the path does not end in .png.
+        ValueError: size or zoom is not > 0, up is zero, or the path does not end in .png.
     """
     if min(size) < 1 or not zoom > 0:
         raise ValueError(f"size and zoom must be > 0; got {size} and {zoom}")
+    if not np.linalg.norm(up) > 0:
+        raise ValueError(f"up must be a direction, not zero; got {up}")
     _check_png(path)
     width, height = (SUPERSAMPLING * n for n in size)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if cut_above is not None:
-        faces = faces[(vertices[faces, 2] <= cut_above).all(axis=1)]
+        heights = vertices @ (np.asarray(up) / np.linalg.norm(up))
+        faces = faces[(heights[faces] <= cut_above).all(axis=1)]
     image = np.full((height, width, 3), 255.0, dtype=np.float32)
     if len(faces):
-        axes = _camera_axes(azimuth, elevation)
+        axes = _camera_axes(azimuth, elevation, up)
         screen = _project(vertices, faces, axes, width, height, zoom)
         pixels, seen_faces = _rasterize(screen[faces], width, height, cull)
         color, depth = _shade(mesh, faces[seen_faces], screen, pixels, width, axes)
@@ -130,11 +136,16 @@ def _check_png(path: str | Path | None) -> None:
         raise ValueError(f"path must end in .png for a picture; got {Path(path).name!r}")
 
 
-def _camera_axes(azimuth: float, elevation: float) -> np.ndarray:
+def _camera_axes(azimuth: float, elevation: float, up: tuple[float, float, float]) -> np.ndarray:
     """(3, 3) unit vectors of the camera in its rows: right, up, and from the scene to the camera."""
     turn, rise = math.radians(azimuth), math.radians(elevation)
-    right = [-math.sin(turn), math.cos(turn), 0.0]
-    back = [math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)]
+    top = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    start = np.eye(3)[1 if abs(top[0]) > 0.9 else 0]
+    ahead = start - (start @ top) * top
+    ahead /= np.linalg.norm(ahead)
+    level = math.cos(turn) * ahead + math.sin(turn) * np.cross(top, ahead)
+    back = math.cos(rise) * level + math.sin(rise) * top
+    right = math.cos(turn) * np.cross(top, ahead) - math.sin(turn) * ahead
     return np.array([right, np.cross(back, right), back])
 
 
@@ -224,8 +235,9 @@ def _shade(
     """(P, 3) lit colors, 0 to 255, and (P,) depths of the seen pixels; corners (P, 3) vertices."""
     vertices = np.asarray(mesh.vertices) @ axes.T
     normals = np.asarray(mesh.vertex_normals) @ axes.T
-    colored = mesh.visual.kind == "vertex"
-    colors = mesh.visual.vertex_colors[:, :3] if colored else np.full((len(vertices), 3), PLAIN)
+    visual: Any = mesh.visual
+    colored = visual is not None and visual.kind == "vertex"
+    colors = visual.vertex_colors[:, :3] if colored else np.full((len(vertices), 3), PLAIN)
     color = np.empty((len(pixels), 3), dtype=np.float32)
     depth = np.empty(len(pixels), dtype=np.float32)
     for start in range(0, len(pixels), CHUNK_PIXELS):

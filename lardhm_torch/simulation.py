@@ -6,6 +6,7 @@ a window, so that rays meet it in closed form and the ground-truth mesh is the s
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -176,12 +177,22 @@ def room_mesh() -> trimesh.Trimesh:
     for *center, radius in SPHERES:
         part = trimesh.creation.icosphere(subdivisions=4, radius=radius)
         parts.append(part.apply_translation(center))
-    furniture = trimesh.util.concatenate(parts)
+    furniture = _join(parts)
     corners = furniture.triangles  # (F, 3 corners, 3)
     on_shell = [np.isclose(corners, wall).all(axis=1).any(axis=1) for wall in (0.0, ROOM)]
     furniture.update_faces(~(on_shell[0] | on_shell[1]))
     furniture.remove_unreferenced_vertices()
-    return trimesh.util.concatenate([furniture, _shell_mesh()])
+    return _join([furniture, _shell_mesh()])
+
+
+def _join(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """All faces in one mesh; nothing is merged."""
+    import trimesh
+
+    before = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + n for part, n in zip(parts, before, strict=False)])
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def _spiral(count: int, rng: torch.Generator) -> Tensor:
@@ -244,8 +255,8 @@ def _shell_mesh() -> trimesh.Trimesh:
             holes = [o for o in OPENINGS if (o.axis, o.far) == (axis, far)]
             u_cuts = sorted({0.0, ROOM[u_axis], *(c for hole in holes for c in hole.u)})
             v_cuts = sorted({0.0, ROOM[v_axis], *(c for hole in holes for c in hole.z)})
-            for u in zip(u_cuts, u_cuts[1:], strict=False):
-                for v in zip(v_cuts, v_cuts[1:], strict=False):
+            for u in itertools.pairwise(u_cuts):
+                for v in itertools.pairwise(v_cuts):
                     if any(hole.u == u and hole.z == v for hole in holes):
                         continue
                     quad = np.full((4, 3), ROOM[axis] if far else 0.0)

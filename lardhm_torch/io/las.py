@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from lardhm_torch.io.readout import Readout
 
-_POINTS_AT_A_TIME = 1_000_000
+_BYTES_AT_A_TIME = 1 << 25
 _VLR_BYTES = 54
+# LAZ item type -> compressed layers (point, color, color and infrared, wave packet); extra bytes
+# (14) have one each, items of older formats none.
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 
 
 def read_las(path: Path) -> Readout:
@@ -22,26 +26,21 @@ def read_las(path: Path) -> Readout:
     Raises:
         ImportError: laspy or its LAZ part is not installed.
         ValueError: the header is not one of LAS, or the file is shorter than it says.
-
-    Source: ASPRS LAS 1.4 R15, public header block.
     """
-    _check_header(path)
-    try:
-        import laspy
-        import lazrs  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            f"{path} needs laspy. Install it: pip install 'lardhm_torch[io]'"
-        ) from error
+    with open(path, "rb") as file:
+        header = _Header(file, path.stat().st_size)
+        if header.is_compressed:
+            _check_compressed(file, header)
     ends, returns = [], []
-    with laspy.open(path, read_evlrs=False) as reader:
-        for points in reader.chunk_iterator(_POINTS_AT_A_TIME):
+    laspy = _import_laspy(path)
+    # One thread: the parallel reader takes memory by the chunk table's word.
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+        for points in reader.chunk_iterator(max(1, _BYTES_AT_A_TIME // header.point_bytes)):
             ends.append(np.stack([points.x, points.y, points.z], axis=1).astype(np.float64))
             returns.append(np.asarray(points.return_number, dtype=np.int64))
-        promised = reader.header.point_count
     got = sum(map(len, ends))
-    if got == 0 or got != promised:
-        raise ValueError(f"{promised} points are promised, at least one is needed; got {got}")
+    if got == 0 or got != header.count:
+        raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
     return Readout(
         np.concatenate(ends),
         target_index=np.maximum(np.concatenate(returns), 1),
@@ -49,23 +48,109 @@ def read_las(path: Path) -> Readout:
     )
 
 
-def _check_header(path: Path) -> None:
-    """Hold what the header promises against the file's size, before anything is allocated."""
-    size = path.stat().st_size
-    with open(path, "rb") as file:
-        header = file.read(375).ljust(375, b"\0")
-    if header[:4] != b"LASF" or size < 227:
-        raise ValueError(f"a LAS file begins with LASF; got {header[:4]!r}")
-    header_size, points_at, num_vlrs = struct.unpack_from("<HII", header, 94)
-    point_format, point_bytes, count = struct.unpack_from("<BHI", header, 104)
-    if header[25] >= 4:
-        (count,) = struct.unpack_from("<Q", header, 247)
-    if not header_size + num_vlrs * _VLR_BYTES <= points_at <= size:
+def _import_laspy(path: Path) -> Any:
+    try:
+        import laspy
+        import lazrs  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            f"{path} needs laspy. Install it: pip install 'lardhm_torch[io]'"
+        ) from error
+    return laspy
+
+
+class _Header:
+    """The public header block, held against the file's size before anything is allocated."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        block = file.read(375).ljust(375, b"\0")
+        if block[:4] != b"LASF" or size < 227:
+            raise ValueError(f"a LAS file begins with LASF and 223 more bytes; got {block[:4]!r}")
+        self.size = size
+        self.header_size, self.points_at, self.num_vlrs = struct.unpack_from("<HII", block, 94)
+        point_format, self.point_bytes, self.count = struct.unpack_from("<BHI", block, 104)
+        if block[25] >= 4:
+            (self.count,) = struct.unpack_from("<Q", block, 247)
+        self.is_compressed = bool(point_format & 0xC0)
+        if not self.header_size + self.num_vlrs * _VLR_BYTES <= self.points_at <= size:
+            raise ValueError(
+                f"{self.num_vlrs} variable records are promised before byte {self.points_at}; "
+                f"the file has {size} bytes"
+            )
+        left = size - self.points_at
+        if self.point_bytes < 20 or (
+            not self.is_compressed and self.count * self.point_bytes > left
+        ):
+            raise ValueError(
+                f"{self.count} points of {self.point_bytes} bytes are promised; got {left} bytes"
+            )
+
+
+def _check_compressed(file: BinaryIO, header: _Header) -> None:
+    """Walk the chunks of a LAZ file by their headers alone.
+
+    The decompressor takes memory by the word of the file, and ends the program if it gets none: a
+    broken file must not reach it. A chunk in layers is one point as it is, the number of points,
+    the bytes of each layer (all uint32), the layers.
+    """
+    items = _compressed_items(file, header)
+    if sum(size for _, size in items) != header.point_bytes:
+        raise ValueError(f"the compressed items {items} must add up to {header.point_bytes} bytes")
+    table_at = _chunk_table_at(file, header)
+    if table_at is None or any(kind not in _LAYERS and kind != 14 for kind, _ in items):
+        return  # older formats: a plain stream, whose end the decompressor sees by itself
+    num_layers = sum(size if kind == 14 else _LAYERS[kind] for kind, size in items)
+    position, count = header.points_at + 8, 0
+    while position < table_at:
+        file.seek(position + header.point_bytes)
+        sizes = _unpack(file, f"<{1 + num_layers}I")
+        count += sizes[0]
+        position = file.tell() + sum(sizes[1:])
+    if position != table_at or count != header.count:
         raise ValueError(
-            f"{num_vlrs} variable records are promised before byte {points_at} of {size}"
+            f"{header.count} points are promised up to byte {table_at}; "
+            f"the chunks hold {count} up to byte {position}"
         )
-    is_compressed = point_format & 0x80
-    if not is_compressed and count * point_bytes > size - points_at:
-        raise ValueError(
-            f"{count} points of {point_bytes} bytes are promised; got {size - points_at} bytes"
-        )
+
+
+def _compressed_items(file: BinaryIO, header: _Header) -> list[tuple[int, int]]:
+    """(type, bytes) of each part of a point, from the LASzip record."""
+    position = header.header_size
+    for _ in range(header.num_vlrs):
+        file.seek(position)
+        _, user, record, length, _ = _unpack(file, "<H16sHH32s")
+        if user.rstrip(b"\0") == b"laszip encoded" and record == 22204:
+            file.seek(position + _VLR_BYTES + 32)
+            (num_items,) = _unpack(file, "<H")
+            if 34 + 6 * num_items != length:
+                raise ValueError(f"{num_items} compressed items do not fit in {length} bytes")
+            values = _unpack(file, f"<{3 * num_items}H")
+            return list(zip(values[::3], values[1::3], strict=True))
+        position += _VLR_BYTES + length
+    raise ValueError("the points are compressed, but there is no LASzip record to say how")
+
+
+def _chunk_table_at(file: BinaryIO, header: _Header) -> int | None:
+    """Position of the chunk table; None where there are no points and no table."""
+    if header.points_at + 8 > header.size:
+        return None
+    file.seek(header.points_at)
+    (table_at,) = _unpack(file, "<q")
+    if table_at == -1:  # written as a stream: the position is at the very end
+        file.seek(header.size - 8)
+        (table_at,) = _unpack(file, "<q")
+    if not header.points_at + 8 <= table_at <= header.size - 8:
+        raise ValueError(f"the chunk table is promised at byte {table_at} of {header.size}")
+    file.seek(table_at + 4)
+    (num_chunks,) = _unpack(file, "<I")
+    if num_chunks > table_at - header.points_at:
+        raise ValueError(f"{num_chunks} chunks are promised in a file of {header.size} bytes")
+    return table_at
+
+
+def _unpack(file: BinaryIO, layout: str) -> tuple[Any, ...]:
+    """Little-endian values at the file's position."""
+    content = file.read(struct.calcsize(layout))
+    if len(content) < struct.calcsize(layout):
+        raise ValueError(f"{struct.calcsize(layout)} bytes are needed; the file ends before")
+    return struct.unpack(layout, content)

@@ -122,6 +122,16 @@ inline typename Simd<T>::I mask_of(uint32_t bits) {
 }
 
 template <class T>
+inline T smallest_lane(typename Simd<T>::V v) {
+  T lanes[Simd<T>::W];
+  std::memcpy(lanes, &v, sizeof(v));
+  for (int half = Simd<T>::W / 2; half > 0; half /= 2)
+    for (int lane = 0; lane < half; ++lane)
+      lanes[lane] = lanes[lane] < lanes[lane + half] ? lanes[lane] : lanes[lane + half];
+  return lanes[0];
+}
+
+template <class T>
 inline T sum_lanes(typename Simd<T>::V v) {
   T lanes[Simd<T>::W];
   std::memcpy(lanes, &v, sizeof(v));
@@ -208,100 +218,78 @@ void run_tasks(int64_t tasks, const Work& work) {
 // ---------------------------------------------------------------------------------------------
 // Index: one block of bytes. Header, then the sections in the order of `Sections`.
 
-constexpr uint64_t kMagic = 0x3178656d6864724cULL;
-constexpr int kBlock = 32;          // centers in a block of the pruned search
-#ifndef TARGET
-#define TARGET 28
-#endif
-constexpr int kTarget = TARGET;         // a leaf with at most this many candidates is not split
-constexpr int kLongList = 192;      // leaves with more candidates use the pruned search
-constexpr int kFinestBits = 20;     // cells along an axis at the finest level: 2^20
-constexpr int32_t kUnset = std::numeric_limits<int32_t>::max();
+constexpr uint64_t kMagic = 0x3278656d6864724cULL;
+constexpr int kBlock = 16;        // centers in a block
+constexpr int kZCurveBits = 20;   // cells along an axis of the Z curve: 2^20
 
 struct Header {
   uint64_t magic, checksum;
-  int64_t bytes, count, leaves, nodes, entries;
-  int32_t dim, item_size, k, depth;  // depth: splits between the enclosing cube and a table cell
-  int32_t grid[4];                   // table cells along each axis; all 0: no table
-  double low[3];                     // corner of the table
-  double side, margin;               // enclosing cube's edge; allowance for rounding [m]
+  int64_t bytes, count;
+  int32_t dim, item_size;
+  double low[3], high[3];  // box of the centers [m]
 };
-
-uint64_t mix(uint64_t hash, uint64_t value) {
-  hash ^= value + 0x9e3779b97f4a7c15ULL + (hash << 6) + (hash >> 2);
-  hash *= 0xff51afd7ed558ccdULL;
-  return hash ^ (hash >> 33);
-}
 
 uint64_t checksum(Header header) {
   header.checksum = 0;
   uint64_t words[sizeof(Header) / 8], hash = kMagic;
   static_assert(sizeof(Header) % 8 == 0, "the header is hashed in words");
   std::memcpy(words, &header, sizeof(header));
-  for (uint64_t word : words) hash = mix(hash, word);
+  for (uint64_t word : words) {
+    hash = (hash ^ word) * 0xff51afd7ed558ccdULL;
+    hash ^= hash >> 33;
+  }
   return hash;
 }
 
-int64_t padded(int64_t count) { return (count + kBlock - 1) / kBlock * kBlock; }
+int64_t padded(int64_t count, int64_t to) { return (count + to - 1) / to * to; }
 
 struct Sections {
-  int64_t centers, order, relative, boxes, root, nodes, leaves, entries, end;
+  int64_t blocks, centers, order, relative, boxes, end;
 
   explicit Sections(const Header& h) {
     int64_t at = sizeof(Header);
     auto section = [&at](int64_t bytes) {
-      const int64_t begin = (at + 63) / 64 * 64;
+      const int64_t begin = padded(at, 64);
       at = begin + bytes;
       return begin;
     };
-    const int64_t cells = int64_t(h.grid[0]) * h.grid[1] * (h.dim == 3 ? h.grid[2] : 1);
+    blocks = padded(h.count, kBlock) / kBlock;
     centers = section(h.count * h.dim * h.item_size);
     order = section(h.count * 4);
-    relative = section(padded(h.count) * h.dim * 4);
-    boxes = section(padded(padded(h.count) / kBlock) * h.dim * 2 * 4);
-    root = section(cells * 4);
-    nodes = section(h.nodes * (1 << h.dim) * 4);
-    leaves = section((h.leaves + 1) * 4);
-    entries = section(h.entries * 4);
-    end = (at + 63) / 64 * 64;
+    relative = section(blocks * kBlock * h.dim * 4);
+    boxes = section(padded(blocks, kBlock) * h.dim * 2 * 4);
+    end = padded(at, 64);
   }
 };
 
 struct Index {
   Header header;
-  const int32_t* order;     // (M,) rank -> row of the centers
-  const float* relative;    // (D, padded M) center - low, by rank; the padding is far away
-  const float* boxes;       // (2, D, padded blocks) low and high corners of the blocks
-  const int32_t* root;      // (cells,) leaf, or ~node
-  const int32_t* nodes;     // (nodes, 2^D) leaf, or ~node
-  const uint32_t* leaves;   // (leaves + 1,) where a leaf's list begins in entries
-  const int32_t* entries;   // ranks, ascending in each list
-  bool has_table() const { return header.grid[0] > 0; }
+  int64_t blocks, block_stride;
+  const int32_t* order;   // (M,) rank -> row of the centers
+  const float* relative;  // (D, kBlock blocks) center - low, by rank; the padding is far away
+  const float* boxes;     // (2, D, block_stride) low and high corners of the blocks
 };
 
 Index view_of(const char* bytes) {
   Index index;
   std::memcpy(&index.header, bytes, sizeof(Header));
   const Sections at(index.header);
+  index.blocks = at.blocks;
+  index.block_stride = padded(at.blocks, kBlock);
   index.order = reinterpret_cast<const int32_t*>(bytes + at.order);
   index.relative = reinterpret_cast<const float*>(bytes + at.relative);
   index.boxes = reinterpret_cast<const float*>(bytes + at.boxes);
-  index.root = reinterpret_cast<const int32_t*>(bytes + at.root);
-  index.nodes = reinterpret_cast<const int32_t*>(bytes + at.nodes);
-  index.leaves = reinterpret_cast<const uint32_t*>(bytes + at.leaves);
-  index.entries = reinterpret_cast<const int32_t*>(bytes + at.entries);
   return index;
 }
 
-// Whether the bytes are an index of exactly these centers, good for k neighbors.
+// Whether the bytes are an index of exactly these centers.
 template <class T, int D>
-bool matches(const char* bytes, int64_t size, const T* centers, int64_t count, int64_t k) {
+bool matches(const char* bytes, int64_t size, const T* centers, int64_t count) {
   Header h;
   if (size < int64_t(sizeof(Header)) || reinterpret_cast<uintptr_t>(bytes) % 8 != 0) return false;
   std::memcpy(&h, bytes, sizeof(Header));
   if (h.magic != kMagic || h.bytes != size || h.checksum != checksum(h)) return false;
   if (h.count != count || h.dim != D || h.item_size != int(sizeof(T))) return false;
-  if (h.k < std::min(k, count)) return false;
   const Sections at(h);
   if (at.end != size) return false;
   const auto* order = reinterpret_cast<const uint32_t*>(bytes + at.order);
@@ -311,81 +299,179 @@ bool matches(const char* bytes, int64_t size, const T* centers, int64_t count, i
          std::memcmp(bytes + at.centers, centers, sizeof(T) * D * count) == 0;
 }
 
-// ---------------------------------------------------------------------------------------------
-// Building: where the table lies, rank order, blocks, then the tree from the top down.
-
 template <class T, int D>
-struct Frame {
-  T low[D];
-  float extent[D];
-  double side;
-  int32_t grid[4] = {1, 1, 1, 0};
-  int32_t depth = 0;
+struct Box {
+  T low[D], high[D];
+
+  Box() {
+    for (int d = 0; d < D; ++d) {
+      low[d] = std::numeric_limits<T>::infinity();
+      high[d] = -low[d];
+    }
+  }
+
+  double largest_edge() const {
+    double edge = 0;
+    for (int d = 0; d < D; ++d) edge = std::max(edge, double(high[d]) - double(low[d]));
+    return edge;
+  }
 };
 
-// Table of about four cubes a center over the box of the centers, enlarged on every side.
-template <class T, int D>
-Frame<T, D> frame_of(const T* centers, int64_t count) {
-  Frame<T, D> frame;
-  T high[D];
-  double largest = 0;
-  for (int d = 0; d < D; ++d) {
-    frame.low[d] = high[d] = count ? centers[d] : T(0);
-    for (int64_t i = 1; i < count; ++i) {
-      frame.low[d] = std::min(frame.low[d], centers[i * D + d]);
-      high[d] = std::max(high[d], centers[i * D + d]);
-    }
-    largest = std::max(largest, double(high[d]) - double(frame.low[d]));
-  }
-  if (!(largest > 0)) largest = 1;
-  double volume = 1, extent[D];
-  for (int d = 0; d < D; ++d) {
-    const double enlarged = double(frame.low[d]) - 0.06 * largest;
-    frame.low[d] = T(enlarged);
-    extent[d] = double(high[d]) + 0.06 * largest - double(frame.low[d]);
-    frame.extent[d] = float(extent[d]);
-    volume *= extent[d];
-  }
-  const double cells = std::min(std::max<double>(4.0 * count, 64.0), 2097152.0);
-  const double edge = std::pow(volume / cells, 1.0 / D);
-  if (!(edge > 1e-30 * largest) || !std::isfinite(largest)) {
-    frame.side = std::numeric_limits<double>::infinity();
-    return frame;
-  }
-  int64_t most = 1;
-  for (int d = 0; d < D; ++d) {
-    frame.grid[d] = int32_t(std::ceil(extent[d] / edge));
-    most = std::max<int64_t>(most, frame.grid[d]);
-  }
-  while ((int64_t(1) << frame.depth) < most) ++frame.depth;
-  frame.side = edge * double(int64_t(1) << frame.depth);
-  return frame;
+template <class T>
+bool is_finite(const T* x, int n) {
+  T sum = 0;
+  for (int d = 0; d < n; ++d) sum += x[d] * T(0);
+  return sum == T(0);
 }
 
+// Z curve: how the bits of the cells along the axes interleave, coarse cells first.
 template <int D>
-uint64_t z_curve(const float* relative, const float* scale) {
-  uint64_t code = 0;
-  for (int d = 0; d < D; ++d) {
-    uint64_t cell = uint64_t(std::min(std::max(relative[d] * scale[d], 0.0f), 65535.0f));
-    for (int bit = 0; bit < 16; ++bit) code |= ((cell >> bit) & 1) << (bit * D + d);
+struct ZCurve {
+  float scale;  // cells a meter
+  int32_t last[D];
+  int bits = 0;
+  std::vector<uint32_t> spread[D];
+
+  // About `cells` cubes over a box with these edges, at most 2^10 along an axis.
+  ZCurve(const double* edges, double cells) {
+    double largest = 0, volume = 1, shortest = 0;
+    for (int d = 0; d < D; ++d) largest = std::max(largest, edges[d]);
+    shortest = largest / 1024;
+    for (int d = 0; d < D; ++d) volume *= std::max(edges[d], shortest);
+    const double edge = std::max(std::pow(volume / cells, 1.0 / D), shortest);
+    const bool usable = edge > 0 && std::isfinite(edge) && std::isfinite(1 / edge);
+    scale = usable ? float(1 / edge) : 0.0f;
+    int axis_bits[D];
+    for (int d = 0; d < D; ++d) {
+      last[d] = usable ? std::min(int32_t(edges[d] / edge), 1023) : 0;
+      for (axis_bits[d] = 0; (last[d] >> axis_bits[d]) != 0;) ++axis_bits[d];
+      spread[d].assign(last[d] + 1, 0);
+    }
+    for (int level = 0; level < 10; ++level)
+      for (int d = D - 1; d >= 0; --d)
+        if (level < axis_bits[d]) assign_bit(d, level);
   }
-  return code;
+
+  void assign_bit(int d, int level) {
+    for (int32_t cell = 0; cell <= last[d]; ++cell)
+      spread[d][cell] |= uint32_t((cell >> level) & 1) << bits;
+    ++bits;
+  }
+
+  uint32_t key(const float* relative) const {
+    uint32_t key = 0;
+    for (int d = 0; d < D; ++d) {
+      const float at = std::min(std::max(relative[d] * scale, 0.0f), float(last[d]));
+      key |= spread[d][int32_t(at)];
+    }
+    return key;
+  }
+};
+
+// One counting pass over a digit of the keys: from -> to, stable.
+void counting_pass(const uint32_t* keys, const int32_t* from, int32_t* to, int64_t n, int shift,
+                   int bits, std::vector<uint32_t>& histogram) {
+  const uint32_t mask = (1u << bits) - 1;
+  histogram.assign(int64_t(mask) + 2, 0);
+  for (int64_t i = 0; i < n; ++i) ++histogram[((keys[i] >> shift) & mask) + 1];
+  for (int64_t digit = 0; digit < int64_t(mask); ++digit) histogram[digit + 1] += histogram[digit];
+  for (int64_t i = 0; i < n; ++i) {
+    const int32_t item = from ? from[i] : int32_t(i);
+    to[histogram[(keys[item] >> shift) & mask]++] = item;
+  }
 }
 
-template <class T, int D>
-std::vector<int32_t> rank_order(const T* centers, int64_t count, const Frame<T, D>& frame) {
-  std::vector<std::pair<uint64_t, int32_t>> keys(count);
-  float scale[D], relative[D];
-  for (int d = 0; d < D; ++d) scale[d] = float(65536.0 / frame.side);
-  for (int64_t i = 0; i < count; ++i) {
-    for (int d = 0; d < D; ++d) relative[d] = float(centers[i * D + d] - frame.low[d]);
-    keys[i] = {z_curve<D>(relative, scale), int32_t(i)};
+struct Sorter {
+  std::vector<uint32_t> keys, histogram;
+  std::vector<int32_t> order, other;
+
+  // order: the items by key, which have so many bits.
+  void sort(int64_t n, int bits) {
+    order.resize(n);
+    const int passes = bits <= 12 ? 1 : (bits + 10) / 11;
+    for (int pass = 0; pass < passes; ++pass) {
+      const int shift = bits * pass / passes, next = bits * (pass + 1) / passes;
+      if (pass > 0) order.swap(other);
+      if (pass > 0) order.resize(n);
+      counting_pass(keys.data(), pass > 0 ? other.data() : nullptr, order.data(), n, shift,
+                    next - shift, histogram);
+    }
   }
-  std::sort(keys.begin(), keys.end());
-  std::vector<int32_t> order(count);
-  for (int64_t rank = 0; rank < count; ++rank) order[rank] = keys[rank].second;
-  return order;
-}
+};
+
+template <class T, int D>
+struct IndexBuilder {
+  Header header{};
+  const T* centers;
+  std::vector<int32_t> order;
+
+  IndexBuilder(const T* centers_, int64_t count) : centers(centers_) {
+    Box<T, D> box;
+    for (int64_t i = 0; i < count; ++i) {
+      if (!is_finite(centers + i * D, D)) continue;
+      for (int d = 0; d < D; ++d) {
+        box.low[d] = std::min(box.low[d], centers[i * D + d]);
+        box.high[d] = std::max(box.high[d], centers[i * D + d]);
+      }
+    }
+    const bool any = box.low[0] <= box.high[0];
+    header.magic = kMagic;
+    header.count = count;
+    header.dim = D;
+    header.item_size = sizeof(T);
+    for (int d = 0; d < D; ++d) {
+      header.low[d] = any ? double(box.low[d]) : 0.0;
+      header.high[d] = any ? double(box.high[d]) : 0.0;
+    }
+    header.bytes = Sections(header).end;
+    header.checksum = checksum(header);
+    sort_centers();
+  }
+
+  float relative(int64_t row, int d) const {
+    return float(centers[row * D + d] - T(header.low[d]));
+  }
+
+  void sort_centers() {
+    double edges[D];
+    for (int d = 0; d < D; ++d) edges[d] = header.high[d] - header.low[d];
+    const ZCurve<D> curve(edges, double(4 * header.count + 1));
+    Sorter sorter;
+    sorter.keys.resize(header.count);
+    for (int64_t row = 0; row < header.count; ++row) {
+      float at[D];
+      for (int d = 0; d < D; ++d) at[d] = relative(row, d);
+      sorter.keys[row] = curve.key(at);
+    }
+    sorter.sort(header.count, curve.bits);
+    order = std::move(sorter.order);
+  }
+
+  void write(char* to) const {
+    const Sections at(header);
+    std::memcpy(to, &header, sizeof(Header));
+    std::memcpy(to + at.centers, centers, sizeof(T) * D * header.count);
+    std::memcpy(to + at.order, order.data(), 4 * order.size());
+    auto* relative_to = reinterpret_cast<float*>(to + at.relative);
+    auto* boxes = reinterpret_cast<float*>(to + at.boxes);
+    const int64_t stride = at.blocks * kBlock, block_stride = padded(at.blocks, kBlock);
+    std::fill(relative_to, relative_to + stride * D, std::numeric_limits<float>::max());
+    std::fill(boxes, boxes + block_stride * D * 2, std::numeric_limits<float>::max());
+    for (int d = 0; d < D; ++d)
+      write_axis(d, relative_to + d * stride, boxes + d * block_stride,
+                 boxes + (D + d) * block_stride);
+  }
+
+  void write_axis(int d, float* to, float* low, float* high) const {
+    for (int64_t rank = 0; rank < header.count; ++rank) {
+      const float x = relative(order[rank], d);
+      if (std::isfinite(x)) to[rank] = x;
+      const int64_t block = rank / kBlock;
+      low[block] = rank % kBlock == 0 ? to[rank] : std::min(low[block], to[rank]);
+      high[block] = rank % kBlock == 0 ? to[rank] : std::max(high[block], to[rank]);
+    }
+  }
+};
 
 // The k smallest of what is inserted, lane by lane, as bits of non-negative floats.
 template <class I, int K>
@@ -442,292 +528,6 @@ struct Smallest {
     case 16: USE(16);        \
     default: USE(0);         \
   }
-
-struct Cell {
-  int32_t level;
-  int32_t at[3];
-};
-
-struct Fill {
-  Cell cell;
-  int32_t entry;
-};
-
-// Leaves and nodes of some part of the tree; entries of `fills` name table cells they cover.
-struct Part {
-  std::vector<Fill> fills;
-  std::vector<int32_t> nodes;
-  std::vector<uint32_t> lengths;
-  std::vector<int32_t> entries;
-};
-
-template <int D>
-struct TreeBuilder {
-  static constexpr int C = 1 << D;
-  using V = typename Vectors<float, C * 4>::V;
-  using I = typename Vectors<float, C * 4>::I;
-  using FarthestFn = I (*)(const TreeBuilder&, const Cell&, const int32_t*, int64_t, I*);
-
-  const float* relative;
-  int64_t stride;
-  Header header;
-  FarthestFn bound;
-  int64_t budget;  // entries a part may hold before it stops splitting
-
-  double edge(int level) const { return header.side / double(int64_t(1) << level); }
-
-  // The 2^D children's distances to the candidates: nearest points' (squared, as bits) are stored,
-  // the k-th smallest of the farthest points' is returned: no child needs more distant centers.
-  template <int K>
-  static I children_bound(const TreeBuilder& b, const Cell& cell, const int32_t* list, int64_t n,
-                          I* nearest) {
-    const float half = float(b.edge(cell.level + 2) + b.header.margin);
-    V middle[D];
-    for (int d = 0; d < D; ++d)
-      for (int c = 0; c < C; ++c)
-        middle[d][c] = float((2 * cell.at[d] + ((c >> (D - 1 - d)) & 1) + 0.5) *
-                             b.edge(cell.level + 1));
-    Smallest<I, K> smallest(b.header.k);
-    for (int64_t i = 0; i < n; ++i) {
-      V near2 = {}, far2 = {};
-      for (int d = 0; d < D; ++d) {
-        const V offset = b.relative[d * b.stride + list[i]] - middle[d];
-        const V distance = (V)((I)offset & 0x7fffffff);
-        const V inside = distance - half;
-        const V outside = (V)((I)inside & ~((I)inside >> 31));
-        near2 += outside * outside;
-        far2 += (distance + half) * (distance + half);
-      }
-      nearest[i] = (I)near2;
-      smallest.insert((I)far2);
-    }
-    const V kth = (V)smallest.last() * 1.00001f;
-    return (I)kth;
-  }
-
-  static FarthestFn bound_for(int k) {
-#define LARDHM_USE(K) return &children_bound<K>
-    LARDHM_FOR_K(k, LARDHM_USE)
-#undef LARDHM_USE
-  }
-
-  // Candidate lists of the children of a cell, each in `lists` with room for n.
-  void split(const Cell& cell, const int32_t* list, int64_t n, std::vector<int32_t>* lists) const {
-    std::unique_ptr<I[]> nearest(new I[n]);
-    const I kth = bound(*this, cell, list, n, nearest.get());
-    int32_t* out[C];
-    int64_t length[C] = {};
-    for (int c = 0; c < C; ++c) {
-      lists[c].resize(n);
-      out[c] = lists[c].data();
-    }
-    for (int64_t i = 0; i < n; ++i) {
-      const uint32_t keep = bits_le<I>(nearest[i], kth);
-      for (int c = 0; c < C; ++c) {
-        out[c][length[c]] = list[i];
-        length[c] += (keep >> c) & 1;
-      }
-    }
-    for (int c = 0; c < C; ++c) lists[c].resize(length[c]);
-  }
-
-  Cell child(const Cell& cell, int c) const {
-    Cell inner{cell.level + 1, {0, 0, 0}};
-    for (int d = 0; d < D; ++d) inner.at[d] = 2 * cell.at[d] + ((c >> (D - 1 - d)) & 1);
-    return inner;
-  }
-
-  bool in_table(const Cell& cell) const {
-    const int shift = header.depth - cell.level;
-    for (int d = 0; d < D; ++d)
-      if (shift >= 0 && (int64_t(cell.at[d]) << shift) >= header.grid[d]) return false;
-    return true;
-  }
-
-  bool is_leaf(const Cell& cell, int64_t n, const Part& part) const {
-    return n <= std::max<int64_t>(kTarget, header.k) || cell.level >= kFinestBits ||
-           int64_t(part.entries.size()) > budget;
-  }
-
-  static int32_t add_leaf(Part& part, const std::vector<int32_t>& list) {
-    part.entries.insert(part.entries.end(), list.begin(), list.end());
-    part.lengths.push_back(uint32_t(list.size()));
-    return int32_t(part.lengths.size()) - 1;
-  }
-
-  // The entry of a cell at or below the table's level; a fill for each cell above it.
-  int32_t grow(const Cell& cell, const std::vector<int32_t>& list, Part& part) const {
-    const bool above = cell.level < header.depth;
-    int32_t entry = kUnset;
-    std::vector<int32_t> lists[C];
-    bool leaf = is_leaf(cell, list.size(), part);
-    if (!leaf) {
-      split(cell, list.data(), list.size(), lists);
-      int64_t total = 0;
-      for (int c = 0; c < C; ++c) total += lists[c].size();
-      leaf = !above && total > int64_t(0.85 * C * list.size());
-    }
-    if (leaf) {
-      entry = add_leaf(part, list);
-    } else if (above) {
-      for (int c = 0; c < C; ++c)
-        if (in_table(child(cell, c))) grow(child(cell, c), lists[c], part);
-      return kUnset;
-    } else {
-      const int64_t node = part.nodes.size() / C;
-      part.nodes.resize(part.nodes.size() + C);
-      for (int c = 0; c < C; ++c) {
-        const int32_t inner = grow(child(cell, c), lists[c], part);
-        part.nodes[node * C + c] = inner;
-      }
-      entry = ~int32_t(node);
-    }
-    if (cell.level <= header.depth) part.fills.push_back({cell, entry});
-    return entry;
-  }
-};
-
-// Table cells named by the fills; `leaves` and `nodes` are how many came in earlier parts.
-template <int D>
-void fill_table(const Header& h, const Part& part, int64_t leaves, int64_t nodes, int32_t* root) {
-  for (const Fill& fill : part.fills) {
-    const int shift = h.depth - fill.cell.level;
-    const int32_t entry =
-        fill.entry >= 0 ? int32_t(fill.entry + leaves) : int32_t(fill.entry - nodes);
-    int64_t begin[3] = {0, 0, 0}, end[3] = {1, 1, 1};
-    for (int d = 0; d < D; ++d) {
-      begin[d] = int64_t(fill.cell.at[d]) << shift;
-      end[d] = std::min<int64_t>(begin[d] + (int64_t(1) << shift), h.grid[d]);
-    }
-    const int64_t inner = D == 3 ? h.grid[2] : 1;
-    for (int64_t x = begin[0]; x < end[0]; ++x)
-      for (int64_t y = begin[1]; y < end[1]; ++y)
-        for (int64_t z = begin[2]; z < end[2]; ++z)
-          root[(x * h.grid[1] + y) * inner + z] = entry;
-  }
-}
-
-template <class T, int D>
-struct IndexBuilder {
-  Header header{};
-  Frame<T, D> frame;
-  const T* centers;
-  std::vector<int32_t> order;
-  std::vector<float> relative;
-  std::vector<Part> parts;
-
-  // with_tree = false: rank order and blocks alone, enough for the pruned search.
-  IndexBuilder(const T* centers_, int64_t count, int64_t k, bool with_tree) : centers(centers_) {
-    frame = frame_of<T, D>(centers, count);
-    header.magic = kMagic;
-    header.count = count;
-    header.dim = D;
-    header.item_size = sizeof(T);
-    header.k = int32_t(std::min(k, count));
-    header.depth = frame.depth;
-    header.side = frame.side;
-    header.margin = frame.side * std::ldexp(1.0, -20);
-    for (int d = 0; d < D; ++d) header.low[d] = double(frame.low[d]);
-    order = rank_order<T, D>(centers, count, frame);
-    fill_relative();
-    if (!with_tree || count == 0 || !std::isfinite(frame.side)) return;
-    for (int d = 0; d < D; ++d) header.grid[d] = frame.grid[d];
-    grow_tree();
-  }
-
-  void fill_relative() {
-    const int64_t stride = padded(header.count);
-    relative.assign(stride * D, std::numeric_limits<float>::max());
-    for (int d = 0; d < D; ++d)
-      for (int64_t rank = 0; rank < header.count; ++rank) {
-        const float x = float(centers[int64_t(order[rank]) * D + d] - frame.low[d]);
-        if (std::isfinite(x)) relative[d * stride + rank] = x;
-      }
-  }
-
-  // The upper levels on one thread, then each of their cells as a part of its own.
-  void grow_tree() {
-    const int64_t budget = std::max<int64_t>(int64_t(1) << 20, 512 * header.count);
-    TreeBuilder<D> tree{relative.data(), padded(header.count), header,
-                        TreeBuilder<D>::bound_for(header.k), budget};
-    std::vector<std::pair<Cell, std::vector<int32_t>>> cells(1);
-    cells[0].first = Cell{0, {0, 0, 0}};
-    for (int64_t rank = 0; rank < header.count; ++rank)
-      cells[0].second.push_back(int32_t(rank));
-    const int serial_levels = header.count > 2000 ? std::min(header.depth, 6 / D) : 0;
-    for (int level = 0; level < serial_levels; ++level) {
-      std::vector<std::pair<Cell, std::vector<int32_t>>> inner;
-      for (auto& [cell, list] : cells) {
-        std::vector<int32_t> lists[TreeBuilder<D>::C];
-        tree.split(cell, list.data(), list.size(), lists);
-        for (int c = 0; c < TreeBuilder<D>::C; ++c)
-          if (tree.in_table(tree.child(cell, c)))
-            inner.emplace_back(tree.child(cell, c), std::move(lists[c]));
-      }
-      cells = std::move(inner);
-    }
-    parts.resize(cells.size());
-    run_tasks(cells.size(),
-              [&](int64_t i) { tree.grow(cells[i].first, cells[i].second, parts[i]); });
-    for (const Part& part : parts) {
-      header.leaves += part.lengths.size();
-      header.nodes += part.nodes.size() / TreeBuilder<D>::C;
-      header.entries += part.entries.size();
-    }
-  }
-
-  int64_t bytes() const { return Sections(header).end; }
-
-  void write(char* to) {
-    const Sections at(header);
-    header.bytes = at.end;
-    header.checksum = checksum(header);
-    std::memcpy(to, &header, sizeof(Header));
-    std::memcpy(to + at.centers, centers, sizeof(T) * D * header.count);
-    std::memcpy(to + at.order, order.data(), 4 * order.size());
-    std::memcpy(to + at.relative, relative.data(), 4 * relative.size());
-    write_boxes(reinterpret_cast<float*>(to + at.boxes));
-    write_tree(to, at);
-  }
-
-  void write_boxes(float* boxes) const {
-    const int64_t stride = padded(header.count), blocks = stride / kBlock;
-    for (int64_t d = 0; d < D; ++d)
-      for (int64_t block = 0; block < padded(blocks); ++block) {
-        float low = std::numeric_limits<float>::max(), high = low;
-        const int64_t begin = block * kBlock, end = std::min(begin + kBlock, header.count);
-        for (int64_t rank = begin; rank < end; ++rank) {
-          const float x = relative[d * stride + rank];
-          low = std::min(low, x);
-          high = rank == begin ? x : std::max(high, x);
-        }
-        boxes[d * padded(blocks) + block] = low;
-        boxes[(D + d) * padded(blocks) + block] = high;
-      }
-  }
-
-  void write_tree(char* to, const Sections& at) const {
-    auto* root = reinterpret_cast<int32_t*>(to + at.root);
-    auto* nodes = reinterpret_cast<int32_t*>(to + at.nodes);
-    auto* starts = reinterpret_cast<uint32_t*>(to + at.leaves);
-    auto* entries = reinterpret_cast<int32_t*>(to + at.entries);
-    int64_t leaves = 0, inner = 0;
-    uint32_t filled = 0;
-    for (const Part& part : parts) {
-      fill_table<D>(header, part, leaves, inner, root);
-      for (int32_t entry : part.nodes)
-        *nodes++ = entry >= 0 ? int32_t(entry + leaves) : int32_t(entry - inner);
-      std::copy(part.entries.begin(), part.entries.end(), entries + filled);
-      for (uint32_t length : part.lengths) {
-        *starts++ = filled;
-        filled += length;
-      }
-      leaves += part.lengths.size();
-      inner += part.nodes.size() / TreeBuilder<D>::C;
-    }
-    *starts = filled;
-  }
-};
 
 // ---------------------------------------------------------------------------------------------
 // Parameters of the clusters by rank, packed once a call.
@@ -796,29 +596,136 @@ void pack_shapes(const Index& index, const T* scale_tril, const T* weights,
 }
 
 // ---------------------------------------------------------------------------------------------
-// Packets: points of one leaf, one a lane.
+// Candidates: centers that can be among the k nearest of some point of a box.
+
+constexpr int kWide = Simd<float>::W;
+using Wide = Simd<float>::V;
+using WideInt = Simd<float>::I;
+
+// Box of points, relative to the corner of the centers' box, grown by what rounding can do.
+template <int D>
+struct Region {
+  float middle[D] = {}, half[D] = {};
+
+  Region() = default;
+
+  template <class T>
+  Region(const Box<T, D>& box, const T* origin, float reach) {
+    float largest = reach;
+    for (int d = 0; d < D; ++d) {
+      const float low = float(box.low[d] - origin[d]), high = float(box.high[d] - origin[d]);
+      middle[d] = 0.5f * (low + high);
+      half[d] = 0.5f * (high - low);
+      largest = std::max(largest, std::max(std::abs(low), std::abs(high)));
+    }
+    for (int d = 0; d < D; ++d) half[d] += largest * 5e-7f;
+  }
+};
+
+// A list of candidates: ranks, ascending, and their relative coordinates.
+template <int D>
+struct Candidates {
+  std::vector<int32_t> rank;
+  std::vector<float> at[D];
+  int64_t size = 0;
+
+  void reserve(int64_t n) {
+    if (int64_t(rank.size()) >= n + kWide + kBlock) return;
+    rank.resize(2 * n + kWide + kBlock);
+    for (int d = 0; d < D; ++d) at[d].resize(2 * n + kWide + kBlock);
+  }
+
+  // Coordinates of the ranks, the last register filled up.
+  void look_up(const Index& index) {
+    reserve(size);
+    const int64_t stride = index.blocks * kBlock;
+    for (int d = 0; d < D; ++d) {
+      for (int64_t i = 0; i < size; ++i) at[d][i] = index.relative[d * stride + rank[i]];
+      for (int64_t i = size; i < size + kWide; ++i) at[d][i] = std::numeric_limits<float>::max();
+    }
+  }
+};
+
+// Appends the items whose bit is set; writes a whole register.
+inline int64_t compress(uint32_t bits, const int32_t* items, int32_t* to) {
+#if defined(LARDHM_AVX512)
+  _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(bits, _mm512_loadu_si512(items)));
+  return __builtin_popcount(bits);
+#else
+  int64_t n = 0;
+  for (int lane = 0; lane < kWide; ++lane) {
+    to[n] = items[lane];
+    n += (bits >> lane) & 1;
+  }
+  return n;
+#endif
+}
+
+template <int D>
+int64_t keep_near(const Region<D>& region, float radius, const Candidates<D>& from, int32_t* to) {
+  const float limit = radius * radius;
+  int32_t limit_bits;
+  std::memcpy(&limit_bits, &limit, 4);
+  int64_t kept = 0;
+  for (int64_t i = 0; i < from.size; i += kWide) {
+    Wide near2 = {};
+    for (int d = 0; d < D; ++d) {
+      const Wide offset = load<Wide>(from.at[d].data() + i) - region.middle[d];
+      const Wide inside = (Wide)((WideInt)offset & 0x7fffffff) - region.half[d];
+      const Wide outside = (Wide)vmax((WideInt)inside, WideInt{});
+      near2 += outside * outside;
+    }
+    uint32_t keep = bits_le<WideInt>((WideInt)near2, limit_bits - WideInt{});
+    if (i + kWide > from.size) keep &= ~0u >> (32 - int(from.size - i));
+    kept += compress(keep, from.rank.data() + i, to + kept);
+  }
+  return kept;
+}
+
+// Members of the blocks of centers within the radius of the region.
+template <int D>
+void keep_blocks(const Region<D>& region, float radius, const Index& index, Candidates<D>& to,
+                 std::vector<float>& near2) {
+  const int64_t stride = index.block_stride;
+  near2.assign(index.blocks, 0);
+  for (int d = 0; d < D; ++d) {
+    const float *low = index.boxes + d * stride, *high = index.boxes + (D + d) * stride;
+    const float region_low = region.middle[d] - region.half[d];
+    const float region_high = region.middle[d] + region.half[d];
+    for (int64_t i = 0; i < index.blocks; ++i) {
+      const float near = std::max(std::max(low[i] - region_high, region_low - high[i]), 0.0f);
+      near2[i] += near * near;
+    }
+  }
+  const float limit = radius * radius * 1.0001f;
+  to.size = 0;
+  for (int64_t i = 0; i < index.blocks; ++i) {
+    if (near2[i] > limit) continue;
+    to.reserve(to.size + kBlock);
+    for (int j = 0; j < kBlock; ++j) to.rank[to.size + j] = int32_t(i * kBlock + j);
+    to.size += kBlock;
+  }
+  if (to.size > 0 && to.rank[to.size - 1] >= index.header.count)
+    to.size -= index.blocks * kBlock - index.header.count;
+}
+
+// ---------------------------------------------------------------------------------------------
+// Packets: neighboring points, one a lane.
 
 template <class T, int D>
 struct Packet {
-  using V = typename Simd<T>::V;
-  V x[D];
-  int64_t row[Simd<T>::W];
+  typename Simd<T>::V x[D];
+  int64_t begin;
+  const int32_t* order;
   int lanes;
+  int64_t row(int lane) const { return begin + order[lane]; }
 };
 
 // The clusters some lane of a packet selected; bits tell which lanes.
-template <class T>
 struct Selection {
   std::vector<int32_t> rank;
   std::vector<uint32_t> bits;
   int64_t size = 0;
-
-  void reserve(int64_t n) {
-    if (int64_t(rank.size()) < n) {
-      rank.resize(2 * n);
-      bits.resize(2 * n);
-    }
-  }
 };
 
 // Squared distances of the packet to the listed centers (as bits, in `distance`); their k-th
@@ -857,26 +764,48 @@ KthFn<T, D> kth_distance_for(int k) {
 // What one thread needs while it works through points.
 template <class T, int D>
 struct Scratch {
-  using I = typename Simd<T>::I;
-  std::vector<int32_t> leaf, order, other, list;
-  std::vector<uint32_t> histogram;
-  AlignedArray<I> distance;
+  Sorter sorter;
+  std::vector<int32_t> rows;
+  std::vector<uint32_t> key;  // of the points in sorted order
+  std::vector<T> x[D];        // their coordinates
+  Candidates<D> far, near;
+  std::vector<int32_t> list;
+  std::vector<float> block_near2;
+  Region<D> region, group;
+  float far_radius = 0, near_radius = 0, radius = 0;  // [m] how far the lists and a packet look
+  AlignedArray<typename Simd<T>::I> distance;
   int64_t room = 0;
-  Selection<T> selected;
+  Selection selected;
 
   void reserve_list(int64_t n) {
     if (n <= room) return;
     room = 2 * n;
+    list.resize(room + kWide);
     distance.allocate(room);
-    selected.reserve(room);
+    selected.rank.resize(room);
+    selected.bits.resize(room);
   }
 };
+
+#ifndef CUT
+#define CUT 2
+#endif
+#ifndef SUPER
+#define SUPER 2048
+#endif
+#ifndef GROUP
+#define GROUP 128
+#endif
+#ifndef PERCELL
+#define PERCELL 4
+#endif
+constexpr int64_t kRegionPoints = SUPER;  // sorted points that share a list of candidates
+constexpr int64_t kGroupPoints = GROUP;    // and a shorter one
 
 template <class T, int D>
 struct Engine {
   using V = typename Simd<T>::V;
   using I = typename Simd<T>::I;
-  using Int = typename Simd<T>::Int;
   static constexpr int W = Simd<T>::W;
 
   Index index;
@@ -884,116 +813,115 @@ struct Engine {
   const T* positions;
   int k;
   KthFn<T, D> kth;
-  T low[D];
-  float scale;  // finest cells a meter
-  std::atomic<bool>* broken;
+  T origin[D];
+  float reach, smallest_radius;  // [m] edge of the centers' box; where guesses begin
 
-  Engine(const Index& index_, const T* points_, const T* positions_, int64_t k_,
-         std::atomic<bool>* broken_)
+  Engine(const Index& index_, const T* points_, const T* positions_, int64_t k_)
       : index(index_), points(points_), positions(positions_), k(int(k_)),
-        kth(kth_distance_for<T, D>(int(k_))), broken(broken_) {
-    for (int d = 0; d < D; ++d) low[d] = T(index.header.low[d]);
-    scale = float(double(1 << kFinestBits) / index.header.side);
-  }
-
-  int32_t outside() const { return int32_t(index.header.leaves); }
-  int32_t invalid() const { return outside() + 1; }
-  int32_t buckets() const { return outside() + 2; }
-
-  // Leaf of each of the points begin .. end.
-  void locate(int64_t begin, int64_t end, int32_t* leaf) const {
-    const int shift = kFinestBits - index.header.depth;
-    float limit[D];
-    for (int d = 0; d < D; ++d)
-      limit[d] = index.has_table() ? float(int64_t(index.header.grid[d]) << shift) : 0.0f;
-    for (int64_t first = begin; first < end; first += 16) {
-      const int n = int(std::min<int64_t>(16, end - first));
-      int32_t cell[D][16], inside[16], table[16];
-      for (int j = 0; j < 16; ++j) inside[j] = 1, table[j] = 0;
-      for (int d = 0; d < D; ++d) {
-        float at[16];
-        for (int j = 0; j < n; ++j)
-          at[j] = float(points[(first + j) * D + d] - low[d]) * scale;
-        for (int j = n; j < 16; ++j) at[j] = 0;
-        for (int j = 0; j < 16; ++j) {
-          const int32_t in = (at[j] >= 0.0f) & (at[j] < limit[d]);
-          inside[j] &= in;
-          cell[d][j] = int32_t(in ? at[j] : 0.0f);
-          table[j] = table[j] * index.header.grid[d] + (cell[d][j] >> shift);
-        }
-      }
-      for (int j = 0; j < n; ++j) {
-        if (!inside[j]) {
-          leaf[first - begin + j] = finite(first + j) ? outside() : invalid();
-          continue;
-        }
-        int32_t entry = index.root[table[j]];
-        for (int down = shift - 1; entry < 0; --down) {
-          int child = 0;
-          for (int d = 0; d < D; ++d) child = 2 * child + ((cell[d][j] >> down) & 1);
-          entry = descend(~entry, child, down);
-        }
-        leaf[first - begin + j] = std::min(entry, outside());
-      }
+        kth(kth_distance_for<T, D>(int(k_))), reach(0) {
+    for (int d = 0; d < D; ++d) {
+      origin[d] = T(index.header.low[d]);
+      reach = std::max(reach, float(index.header.high[d] - index.header.low[d]));
     }
+    smallest_radius = std::max(1e-30f, 1e-4f * reach);
   }
 
-  int32_t descend(int32_t node, int child, int down) const {
-    if (node >= index.header.nodes || down < 0) return outside();
-    return index.nodes[int64_t(node) * (1 << D) + child];
-  }
-
-  bool finite(int64_t row) const {
+  // Box of the finite points begin .. end; false where some point is not finite.
+  bool box_of(int64_t begin, int64_t end, int64_t step, Box<T, D>& box) const {
     T sum = 0;
-    for (int d = 0; d < D; ++d) sum += points[row * D + d] * T(0);
+    for (int64_t row = begin; row < end; row += step)
+      for (int d = 0; d < D; ++d) {
+        const T x = points[row * D + d];
+        sum += x * T(0);
+        box.low[d] = x < box.low[d] ? x : box.low[d];
+        box.high[d] = x > box.high[d] ? x : box.high[d];
+      }
     return sum == T(0);
   }
 
-  // One counting pass over a digit of the leaf numbers: from -> to, stable.
-  void counting_pass(const int32_t* leaf, const int32_t* from, int32_t* to, int64_t n, int shift,
-                     uint32_t mask, std::vector<uint32_t>& histogram) const {
-    histogram.assign(int64_t(mask) + 2, 0);
-    for (int64_t i = 0; i < n; ++i) ++histogram[((uint32_t(leaf[i]) >> shift) & mask) + 1];
-    for (int64_t digit = 0; digit < int64_t(mask); ++digit) histogram[digit + 1] += histogram[digit];
+  // Sorts the finite points along a Z curve over their box, s.sorter.order; others are shown to
+  // the visitor at once. Returns how many are left.
+  template <class Visitor>
+  int64_t sort_points(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor& visitor) const {
+    Box<T, D> box;
+    const bool all_finite = box_of(begin, end, 1, box);
+    const int64_t n = end - begin;
+    s.sorter.keys.resize(n);
+    double edges[D];
+    T low[D];
+    for (int d = 0; d < D; ++d) {
+      // Far outside the centers' box the order matters little, and would cost resolution inside.
+      low[d] = std::max(box.low[d], T(index.header.low[d] - 0.5 * reach));
+      const T high = std::min(box.high[d], T(index.header.high[d] + 0.5 * reach));
+      edges[d] = std::max(double(high) - double(low[d]), 0.0);
+    }
+    const ZCurve<D> curve(edges, std::max<double>(1, double(n) / PERCELL));
     for (int64_t i = 0; i < n; ++i) {
-      const int32_t point = from ? from[i] : int32_t(i);
-      to[histogram[(uint32_t(leaf[point]) >> shift) & mask]++] = point;
+      float at[D];
+      for (int d = 0; d < D; ++d) at[d] = float(points[(begin + i) * D + d] - low[d]);
+      s.sorter.keys[i] = curve.key(at);
     }
+    s.sorter.sort(n, curve.bits);
+    if (all_finite) return n;
+    int64_t kept = 0;
+    for (int64_t i = 0; i < n; ++i) {
+      const int32_t item = s.sorter.order[i];
+      if (is_finite(points + (begin + item) * D, D))
+        s.sorter.order[kept++] = item;
+      else
+        visitor.invalid(begin + item);
+    }
+    return kept;
   }
 
-  void sort_by_leaf(int64_t n, Scratch<T, D>& s) const {
-    int bits = 1;
-    while ((int64_t(1) << bits) < buckets()) ++bits;
-    s.order.resize(n);
-    if (bits <= 12 || (int64_t(1) << bits) <= n / 8) {
-      counting_pass(s.leaf.data(), nullptr, s.order.data(), n, 0, (1u << bits) - 1, s.histogram);
-      return;
-    }
-    s.other.resize(n);
-    const int low_bits = (bits + 1) / 2;
-    counting_pass(s.leaf.data(), nullptr, s.other.data(), n, 0, (1u << low_bits) - 1, s.histogram);
-    counting_pass(s.leaf.data(), s.other.data(), s.order.data(), n, low_bits,
-                  (1u << (bits - low_bits)) - 1, s.histogram);
+  // Points in sorted order, axis by axis, the last one again up to a full register.
+  void gather(int64_t begin, int64_t n, Scratch<T, D>& s) const {
+    for (int d = 0; d < D; ++d) s.x[d].resize(n + W);
+    s.key.resize(n);
+    for (int64_t i = 0; i < n; ++i) s.key[i] = s.sorter.keys[s.sorter.order[i]];
+    for (int64_t i = 0; i < n; ++i)
+      for (int d = 0; d < D; ++d) s.x[d][i] = points[(begin + s.sorter.order[i]) * D + d];
+    for (int d = 0; d < D; ++d)
+      for (int i = 0; i < W; ++i) s.x[d][n + i] = s.x[d][n - 1];
   }
 
-  // Up to W points; the last one again in lanes that are left over.
-  void gather(int64_t begin, const int32_t* order, int lanes, Packet<T, D>& packet) const {
-    T x[D][W];
-    for (int lane = 0; lane < W; ++lane) {
-      const int64_t row = begin + order[std::min(lane, lanes - 1)];
-      packet.row[lane] = row;
-      for (int d = 0; d < D; ++d) x[d][lane] = points[row * D + d];
+  // Where the run of sorted points i .. stop should end: not across a border of the Z curve's cells
+  // whose cell holds many more points, for the curve jumps there and the run's box would be large.
+  static int64_t cut(const std::vector<uint32_t>& key, int64_t i, int64_t stop) {
+    const int64_t n = key.size(), around = CUT * (stop - i);
+    while (key[i] != key[stop - 1]) {
+      const int bit = 31 - __builtin_clz(key[i] ^ key[stop - 1]);
+      const uint32_t cell = key[i] >> (bit + 1);
+      const bool crowded = (i >= around && key[i - around] >> (bit + 1) == cell) ||
+                           (stop - 1 + around < n && key[stop - 1 + around] >> (bit + 1) == cell);
+      if (!crowded) break;
+      const uint32_t border = key[stop - 1] >> bit << bit;
+      stop = std::lower_bound(key.begin() + i, key.begin() + stop, border) - key.begin();
     }
-    for (int d = 0; d < D; ++d) packet.x[d] = load<V>(x[d]);
-    packet.lanes = lanes;
+    return stop;
   }
 
-  // Fills s.selected with the k nearest of the listed centers, lane by lane; ties go to the lower
+  static Box<T, D> box_of_sorted(const Scratch<T, D>& s, int64_t begin, int64_t end) {
+    Box<T, D> box;
+    for (int d = 0; d < D; ++d) {
+      V low = load<V>(s.x[d].data() + begin), high = low;
+      for (int64_t i = begin + W; i < end; i += W) {
+        const V x = load<V>(s.x[d].data() + i);
+        low = x < low ? x : low;
+        high = x > high ? x : high;
+      }
+      box.low[d] = smallest_lane<T>(low);
+      box.high[d] = -smallest_lane<T>(-high);
+    }
+    return box;
+  }
+
+  // Fills s.selected with the listed centers within the limit, k in each lane; ties go to the lower
   // row of the centers.
-  void select(const Packet<T, D>& packet, const int32_t* list, int64_t n, Scratch<T, D>& s) const {
-    const I limit = kth(packet, positions, list, n, k, s.distance.data);
-    const uint32_t all = packet.lanes == 32 ? ~0u : (1u << packet.lanes) - 1;
-    Selection<T>& selected = s.selected;
+  void select(const Packet<T, D>& packet, I limit, const int32_t* list, int64_t n,
+              Scratch<T, D>& s) const {
+    const uint32_t all = ~0u >> (32 - packet.lanes);
+    Selection& selected = s.selected;
     int64_t size = 0, total = 0;
     for (int64_t i = 0; i < n; ++i) {
       const uint32_t bits = bits_le<I>(s.distance.data[i], limit) & all;
@@ -1009,7 +937,7 @@ struct Engine {
 
   // Of the candidates at exactly the k-th distance of a lane, keeps those of the lowest rows.
   void break_ties(int lanes, I limit, const int32_t* list, Scratch<T, D>& s) const {
-    Selection<T>& selected = s.selected;
+    Selection& selected = s.selected;
     std::vector<std::pair<int32_t, int64_t>> tied;
     for (int lane = 0; lane < lanes; ++lane) {
       int nearer = 0;
@@ -1028,156 +956,80 @@ struct Engine {
     }
   }
 
-  // Every center that can be among the k nearest of a point in the packet, by blocks: exact
-  // anywhere in space.
-  void prune(const Packet<T, D>& packet, Scratch<T, D>& s) const {
-    float box_low[D], box_high[D], largest = float(index.header.side);
-    for (int d = 0; d < D; ++d) {
-      box_low[d] = std::numeric_limits<float>::infinity();
-      box_high[d] = -box_low[d];
-      for (int lane = 0; lane < packet.lanes; ++lane) {
-        const float x = float(packet.x[d][lane] - low[d]);
-        box_low[d] = std::min(box_low[d], x);
-        box_high[d] = std::max(box_high[d], x);
-        largest = std::max(largest, std::abs(x));
-      }
-    }
-    const float margin = largest * std::ldexp(1.0f, -20);
-    const int64_t count = index.header.count, blocks = padded(count) / kBlock;
-    const int64_t stride = padded(blocks), full = count / kBlock;
-    std::vector<float>& far = farthest_buffer();
-    far.resize(std::max(full, padded(count)));
-    for (int64_t block = 0; block < full; ++block) far[block] = block_far(box_low, box_high, block, stride);
-    const float bound = enlarged(kth_of(far, full, (k + kBlock - 1) / kBlock), margin);
-    s.list.clear();
-    for (int64_t block = 0; block < blocks; ++block) {
-      if (block_near(box_low, box_high, block, stride) > bound) continue;
-      for (int64_t rank = block * kBlock; rank < std::min(count, (block + 1) * kBlock); ++rank)
-        s.list.push_back(int32_t(rank));
-    }
-    tighten(box_low, box_high, margin, s, far);
-  }
-
-  static std::vector<float>& farthest_buffer() {
-    static thread_local std::vector<float> buffer;
-    return buffer;
-  }
-
-  static float kth_of(std::vector<float>& values, int64_t n, int64_t kth) {
-    if (n < kth) return std::numeric_limits<float>::infinity();
-    std::nth_element(values.begin(), values.begin() + (kth - 1), values.begin() + n);
-    return values[kth - 1];
-  }
-
-  // A squared distance with the allowance for rounding of the coordinates.
-  static float enlarged(float squared, float margin) {
-    const float distance = std::sqrt(squared) + 4 * margin;
-    return distance * distance * 1.00001f;
-  }
-
-  float block_far(const float* box_low, const float* box_high, int64_t block,
-                  int64_t stride) const {
-    float sum = 0;
-    for (int d = 0; d < D; ++d) {
-      const float a = index.boxes[(D + d) * stride + block] - box_low[d];
-      const float b = box_high[d] - index.boxes[d * stride + block];
-      const float far = std::max(a, b);
-      sum += far * far;
-    }
-    return sum;
-  }
-
-  float block_near(const float* box_low, const float* box_high, int64_t block,
-                   int64_t stride) const {
-    float sum = 0;
-    for (int d = 0; d < D; ++d) {
-      const float a = index.boxes[d * stride + block] - box_high[d];
-      const float b = box_low[d] - index.boxes[(D + d) * stride + block];
-      const float near = std::max(std::max(a, b), 0.0f);
-      sum += near * near;
-    }
-    return sum;
-  }
-
-  // Keeps of s.list the centers nearer to the box than the k-th smallest farthest distance.
-  void tighten(const float* box_low, const float* box_high, float margin, Scratch<T, D>& s,
-               std::vector<float>& far) const {
-    const int64_t stride = padded(index.header.count), n = s.list.size();
-    std::vector<float> near(n);
-    for (int64_t i = 0; i < n; ++i) {
-      float near2 = 0, far2 = 0;
-      for (int d = 0; d < D; ++d) {
-        const float a = index.relative[d * stride + s.list[i]] - box_high[d];
-        const float b = box_low[d] - index.relative[d * stride + s.list[i]];
-        const float inner = std::max(std::max(a, b), 0.0f), outer = std::min(a, b);
-        near2 += inner * inner;
-        far2 += outer * outer;
-      }
-      near[i] = near2;
-      far[i] = far2;
-    }
-    const float bound = enlarged(kth_of(far, n, k), margin);
-    int64_t kept = 0;
-    for (int64_t i = 0; i < n; ++i) {
-      s.list[kept] = s.list[i];
-      kept += !(near[i] > bound);
-    }
-    s.list.resize(kept);
-  }
-
   // Shows the visitor the points begin .. end: packet by packet with s.selected filled in, or one
   // by one where a coordinate is not finite.
   template <class Visitor>
   void visit(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor& visitor) const {
-    const int64_t n = end - begin;
-    s.leaf.resize(n);
-    locate(begin, end, s.leaf.data());
-    sort_by_leaf(n, s);
-    Packet<T, D> packet;
-    for (int64_t i = 0; i < n;) {
-      const int32_t leaf = s.leaf[s.order[i]];
-      if (leaf == invalid()) {
-        visitor.invalid(begin + s.order[i++]);
-        continue;
+    const int64_t n = sort_points(begin, end, s, visitor);
+    if (n == 0) return;
+    gather(begin, n, s);
+    for (int64_t i = 0, stop; i < n; i = stop) {
+      stop = cut(s.key, i, std::min(n, i + kRegionPoints));
+      s.region = region_of(s, i, stop);
+      s.far_radius = s.near_radius = -1;
+      for (int64_t j = i, end; j < stop; j = end) {
+        end = cut(s.key, j, std::min(stop, j + kGroupPoints));
+        s.group = region_of(s, j, end);
+        s.near_radius = -1;
+        visit_group(begin, j, end, s, visitor);
       }
-      int64_t stop = i + 1;
-      while (stop < n && s.leaf[s.order[stop]] == leaf) ++stop;
-      visit_leaf(leaf, begin, i, stop, packet, s, visitor);
-      i = stop;
     }
   }
 
+  Region<D> region_of(const Scratch<T, D>& s, int64_t begin, int64_t end) const {
+    return Region<D>(box_of_sorted(s, begin, end), origin, reach);
+  }
+
   template <class Visitor>
-  void visit_leaf(int32_t leaf, int64_t begin, int64_t i, int64_t stop, Packet<T, D>& packet,
-                  Scratch<T, D>& s, Visitor& visitor) const {
-    const int32_t* list = nullptr;
-    int64_t length = 0;
-    if (leaf != outside()) list = leaf_list(leaf, length);
-    if (length <= kLongList && list) s.reserve_list(length);
-    for (; i < stop; i += W) {
-      gather(begin, s.order.data() + i, int(std::min<int64_t>(W, stop - i)), packet);
-      if (!list || length > kLongList) {
-        prune(packet, s);
-        s.reserve_list(s.list.size());
-        select(packet, s.list.data(), s.list.size(), s);
-      } else {
-        select(packet, list, length, s);
-      }
+  void visit_group(int64_t begin, int64_t i, int64_t stop, Scratch<T, D>& s,
+                   Visitor& visitor) const {
+    Packet<T, D> packet;
+    for (int64_t end; i < stop; i = end) {
+      end = cut(s.key, i, std::min<int64_t>(stop, i + W));
+      packet.begin = begin;
+      packet.order = s.sorter.order.data() + i;
+      packet.lanes = int(end - i);
+      for (int d = 0; d < D; ++d) packet.x[d] = load<V>(s.x[d].data() + i);
+      search(packet, region_of(s, i, i + 1), s);
       visitor.packet(packet, s.selected);
     }
   }
 
-  // The list of a leaf; null, with `broken` set, where the index holds rubbish.
-  const int32_t* leaf_list(int32_t leaf, int64_t& length) const {
-    const int64_t from = index.leaves[leaf], to = index.leaves[leaf + 1];
-    bool good = from <= to && to <= index.header.entries && to - from >= k;
-    uint32_t largest = 0;
-    for (int64_t i = from; good && i < to; ++i)
-      largest = std::max(largest, uint32_t(index.entries[i]));
-    good = good && int64_t(largest) < index.header.count;
-    if (!good) broken->store(true);
-    length = good ? to - from : 0;
-    return good ? index.entries + from : nullptr;
+  // Selects among the centers within a radius of the packet: a guess from the packet before. Where
+  // the k-th distance turns out larger, that distance is the radius of the second attempt.
+  void search(const Packet<T, D>& packet, const Region<D>& region, Scratch<T, D>& s) const {
+    float radius = std::max(s.radius, smallest_radius);
+    for (;;) {
+      if (radius > s.near_radius) look_farther(1.3f * radius, s);
+      const int64_t n = keep_near(region, radius, s.near, s.list.data());
+      if (n < k) {
+        radius = 2 * radius;
+        continue;
+      }
+      const I limit = kth(packet, positions, s.list.data(), n, k, s.distance.data);
+      const float farthest = std::sqrt(float(-smallest_lane<T>(-(V)limit))) * 1.00001f;
+      if (farthest <= radius) {
+        s.radius = farthest * 1.15f;
+        return select(packet, limit, s.list.data(), n, s);
+      }
+      radius = farthest;
+    }
+  }
+
+  // Fills s.near with the centers within the radius of the group, and s.far, of the region.
+  void look_farther(float radius, Scratch<T, D>& s) const {
+    if (radius > s.far_radius) {
+      s.far_radius = 1.3f * radius;
+      keep_blocks(s.region, s.far_radius, index, s.far, s.block_near2);
+      s.far.look_up(index);
+      s.far.size = keep_near(s.region, s.far_radius, s.far, s.far.rank.data());
+      s.far.look_up(index);
+    }
+    s.near_radius = radius;
+    s.near.reserve(s.far.size);
+    s.near.size = keep_near(s.group, radius, s.far, s.near.rank.data());
+    s.near.look_up(index);
+    s.reserve_list(s.near.size);
   }
 };
 
@@ -1202,11 +1054,11 @@ inline typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
   return exp_negative<T>(squared * T(-0.5));
 }
 
-template <class T>
-inline void store_rows(typename Simd<T>::V value, const int64_t* row, int lanes, T* to) {
+template <class T, int D>
+inline void store_rows(typename Simd<T>::V value, const Packet<T, D>& packet, T* to) {
   T lane_value[Simd<T>::W];
   std::memcpy(lane_value, &value, sizeof(value));
-  for (int lane = 0; lane < lanes; ++lane) to[row[lane]] = lane_value[lane];
+  for (int lane = 0; lane < packet.lanes; ++lane) to[packet.row(lane)] = lane_value[lane];
 }
 
 template <class T, int D>
@@ -1218,7 +1070,7 @@ struct OccupancyVisitor {
 
   void invalid(int64_t row) { out[row] = std::numeric_limits<T>::quiet_NaN(); }
 
-  void packet(const Packet<T, D>& packet, const Selection<T>& selected) {
+  void packet(const Packet<T, D>& packet, const Selection& selected) {
     using L = Layout<D>;
     V sum = {};
     for (int64_t j = 0; j < selected.size; ++j) {
@@ -1228,7 +1080,7 @@ struct OccupancyVisitor {
       const V term = kernel_of<T, D>(z) * shape[L::weight];
       sum = mask_of<T>(selected.bits[j]) ? sum + term : sum;
     }
-    store_rows<T>(probability ? sigmoid<T>(sum) : sum, packet.row, packet.lanes, out);
+    store_rows<T, D>(probability ? sigmoid<T>(sum) : sum, packet, out);
   }
 };
 
@@ -1242,12 +1094,12 @@ struct NearestVisitor {
     for (int64_t j = 0; j < k; ++j) out[row * k + j] = j;
   }
 
-  void packet(const Packet<T, D>& packet, const Selection<T>& selected) {
+  void packet(const Packet<T, D>& packet, const Selection& selected) {
     int64_t filled[Simd<T>::W] = {};
     for (int64_t j = 0; j < selected.size; ++j)
       for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
-        insert(out + packet.row[lane] * k, filled[lane]++, order[selected.rank[j]]);
+        insert(out + packet.row(lane) * k, filled[lane]++, order[selected.rank[j]]);
       }
   }
 
@@ -1275,7 +1127,7 @@ struct BackwardVisitor {
     for (int d = 0; d < D; ++d) grad_points[row * D + d] = std::numeric_limits<T>::quiet_NaN();
   }
 
-  void packet(const Packet<T, D>& packet, const Selection<T>& selected) {
+  void packet(const Packet<T, D>& packet, const Selection& selected) {
     bytes.resize((selected.size + 1) * (D + 1) * sizeof(V) + 64);
     V* terms = reinterpret_cast<V*>((reinterpret_cast<uintptr_t>(bytes.data()) + 63) / 64 * 64);
     const V g = incoming(packet, selected, terms);
@@ -1284,11 +1136,11 @@ struct BackwardVisitor {
       cluster(selected.rank[j], g, terms + j * (D + 1), towards);
     if (!(wanted & kPoints)) return;
     for (int lane = 0; lane < packet.lanes; ++lane)
-      for (int d = 0; d < D; ++d) grad_points[packet.row[lane] * D + d] = -towards[d][lane];
+      for (int d = 0; d < D; ++d) grad_points[packet.row(lane) * D + d] = -towards[d][lane];
   }
 
   // Gradient that reaches the log-odds; the terms of a cluster are z and the masked kernel value.
-  V incoming(const Packet<T, D>& packet, const Selection<T>& selected, V* terms) const {
+  V incoming(const Packet<T, D>& packet, const Selection& selected, V* terms) const {
     V sum = {}, g = {};
     for (int64_t j = 0; j < selected.size; ++j) {
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
@@ -1297,7 +1149,7 @@ struct BackwardVisitor {
       z[D] = mask_of<T>(selected.bits[j]) ? kernel_of<T, D>(z) : V{};
       sum += z[D] * shape[L::weight];
     }
-    for (int lane = 0; lane < packet.lanes; ++lane) g[lane] = grad[packet.row[lane]];
+    for (int lane = 0; lane < packet.lanes; ++lane) g[lane] = grad[packet.row(lane)];
     if (!probability) return g;
     const V p = sigmoid<T>(sum);
     return g * p * sigmoid<T>(-sum);
@@ -1340,13 +1192,13 @@ struct AssignVisitor {
 
   void invalid(int64_t row) { labels[row] = -1; }
 
-  void packet(const Packet<T, D>& packet, const Selection<T>& selected) {
+  void packet(const Packet<T, D>& packet, const Selection& selected) {
     for (int64_t j = 0; j < selected.size; ++j) {
       const int64_t rank = selected.rank[j];
       const T* center = positions + rank * Layout<D>::position;
       for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
-        labels[packet.row[lane]] = order[rank];
+        labels[packet.row(lane)] = order[rank];
         T offset[D];
         for (int d = 0; d < D; ++d) offset[d] = packet.x[d][lane] - center[d];
         add(offset, sums + rank * kMoments);
@@ -1367,8 +1219,8 @@ struct AssignVisitor {
 // ---------------------------------------------------------------------------------------------
 // Running a visitor over all points.
 
-constexpr int64_t kCoherentBlock = 32768;
-constexpr int64_t kScatteredBlock = int64_t(1) << 19;
+constexpr int64_t kSmallBlock = 32768;
+constexpr int64_t kLargeBlock = int64_t(1) << 20;
 
 // An index for the call: the one given where it fits, else one of its own.
 template <class T, int D>
@@ -1376,45 +1228,42 @@ struct CallIndex {
   AlignedArray<char> own;
   Index index;
 
-  CallIndex(const Tensor* given, const T* centers, int64_t count, int64_t k, int64_t num_points) {
-    if (given && given->numel() > 0) {
-      const char* bytes = static_cast<const char*>(given->const_data_ptr());
-      if (matches<T, D>(bytes, given->numel(), centers, count, k)) {
-        index = view_of(bytes);
-        return;
-      }
+  CallIndex(const Tensor& given, const T* centers, int64_t count) {
+    const char* bytes = static_cast<const char*>(given.const_data_ptr());
+    if (!matches<T, D>(bytes, given.numel(), centers, count)) {
+      const IndexBuilder<T, D> builder(centers, count);
+      own.allocate(builder.header.bytes);
+      builder.write(own.data);
+      bytes = own.data;
     }
-    build(centers, count, k, num_points > count);
-  }
-
-  void build(const T* centers, int64_t count, int64_t k, bool with_tree) {
-    IndexBuilder<T, D> builder(centers, count, k, with_tree);
-    own.allocate(builder.bytes());
-    builder.write(own.data);
-    index = view_of(own.data);
+    index = view_of(bytes);
   }
 };
 
-// Points that follow each other share leaves: lattices and scans do, shuffled points do not.
 template <class T, int D>
-bool is_coherent(const Engine<T, D>& engine, int64_t n) {
-  constexpr int64_t kSample = 1024;
-  if (n < 8 * kSample) return false;
-  std::vector<int32_t> leaf(kSample);
-  int64_t distinct = 0;
-  for (int64_t sample = 0; sample < 4; ++sample) {
-    const int64_t begin = (n - kSample) / 3 * sample;
-    engine.locate(begin, begin + kSample, leaf.data());
-    std::sort(leaf.begin(), leaf.end());
-    distinct += std::unique(leaf.begin(), leaf.end()) - leaf.begin();
-  }
-  return distinct < kSample;
+double volume_of(const Engine<T, D>& engine, int64_t begin, int64_t end, int64_t step) {
+  Box<T, D> box;
+  engine.box_of(begin, end, step, box);
+  double volume = 1;
+  for (int d = 0; d < D; ++d)
+    volume *= std::max(double(box.high[d]) - double(box.low[d]), 0.01 * engine.reach);
+  return volume;
 }
 
+// Points sorted together: small blocks stay in the cache, and are enough where points that follow
+// each other lie close together, as in lattices and scans; shuffled points need large ones.
 template <class T, int D>
 int64_t block_size(const Engine<T, D>& engine, int64_t n, int64_t workers) {
   const int64_t share = std::max<int64_t>((n + workers - 1) / workers, 256);
-  return std::min(share, is_coherent(engine, n) ? kCoherentBlock : kScatteredBlock);
+  if (share <= kSmallBlock) return share;
+  const double all = volume_of(engine, 0, n, n / 512);
+  double blocks = 0;
+  for (int64_t i = 0; i < 4; ++i) {
+    const int64_t begin = (n - kSmallBlock) / 4 * i;
+    blocks += 0.25 * volume_of(engine, begin, begin + kSmallBlock, kSmallBlock / 512);
+  }
+  const bool coherent = blocks * double(n) < 3 * all * double(kSmallBlock);
+  return coherent ? kSmallBlock : std::min(share, kLargeBlock);
 }
 
 // Runs a copy of the visitor over blocks of points, on all threads.
@@ -1494,31 +1343,24 @@ auto dispatch(const Tensor& centers, const Use& use) {
 
 void check_k(int64_t k) { STD_TORCH_CHECK(k >= 1, "k must be at least 1; got ", k); }
 
-// Runs `work(engine, positions)` with an index that fits, again with a fresh one if it was damaged.
+// Runs `work(engine, positions)` with an index that fits the centers.
 template <class T, int D, class Work>
 void with_engine(const Tensor& points, const Tensor& centers, int64_t k, const Tensor& given,
                  const Work& work) {
-  const int64_t count = centers.size(0);
-  CallIndex<T, D> call(&given, in<T>(centers), count, k, points.size(0));
-  std::atomic<bool> broken{false};
+  const CallIndex<T, D> call(given, in<T>(centers), centers.size(0));
   AlignedArray<T> positions;
-  for (int attempt = 0; attempt < 2; ++attempt) {
-    if (attempt == 1) call.build(in<T>(centers), count, k, true);
-    pack_positions<T, D>(call.index, in<T>(centers), positions);
-    const Engine<T, D> engine(call.index, in<T>(points), positions.data, k, &broken);
-    work(engine, positions.data);
-    if (!broken) return;
-  }
+  pack_positions<T, D>(call.index, in<T>(centers), positions);
+  work(Engine<T, D>(call.index, in<T>(points), positions.data, k), positions.data);
 }
 
 Tensor build_index(const Tensor& given_centers, int64_t k) {
   check_k(k);
   const Tensor centers = tidy(given_centers);
   return dispatch(centers, [&](auto type, auto dim) {
-    IndexBuilder<decltype(type), dim()> builder(in<decltype(type)>(centers), centers.size(0), k,
-                                                true);
+    const IndexBuilder<decltype(type), dim()> builder(in<decltype(type)>(centers),
+                                                      centers.size(0));
     const Tensor index =
-        torch::stable::new_empty(centers, {builder.bytes()}, ScalarType::Byte);
+        torch::stable::new_empty(centers, {builder.header.bytes}, ScalarType::Byte);
     builder.write(out<char>(index));
     return index;
   });
@@ -1529,8 +1371,8 @@ bool index_matches(const Tensor& index, const Tensor& given_centers, int64_t k) 
   if (index.scalar_type() != ScalarType::Byte || !index.is_contiguous()) return false;
   const Tensor centers = tidy(given_centers);
   return dispatch(centers, [&](auto type, auto dim) {
-    return index.numel() > 0 && matches<decltype(type), dim()>(in<char>(index), index.numel(),
-                                                   in<decltype(type)>(centers), centers.size(0), k);
+    return matches<decltype(type), dim()>(in<char>(index), index.numel(),
+                                          in<decltype(type)>(centers), centers.size(0));
   });
 }
 

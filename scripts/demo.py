@@ -1,0 +1,51 @@
+"""The main job from end to end: simulate a room, fit a map, evaluate it, mesh it, draw it.
+
+Usage: python scripts/demo.py [FOLDER]    (default: out)
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from lardhm_torch import (
+    LardHilbertMap,
+    extract_mesh,
+    sample_rays,
+    save_scans,
+    simulate_room,
+    split_rays,
+)
+from lardhm_torch.meshing import save_mesh
+from lardhm_torch.metrics import evaluate, format_metrics, mesh_metrics
+from lardhm_torch.rendering import render_mesh, render_slice
+from lardhm_torch.simulation import room_mesh
+
+
+def main(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+
+    scans = simulate_room(seed=0)
+    save_scans(scans, folder / "scans.npz")
+    train, test = split_rays(scans, ratio=0.8, seed=0)
+    print(f"simulated {len(scans)} rays of {scans.num_scans} scanners; {len(train)} train the map")
+
+    samples = sample_rays(train, seed=0)
+    model = LardHilbertMap(dim=3).fit(samples.points, samples.labels, seed=0, progress=True)
+    model.save(folder / "map.pt")
+    print(f"{len(samples)} labelled points -> {len(model)} clusters")
+
+    with torch.no_grad():
+        print(format_metrics(evaluate(model, test)))
+    mesh = extract_mesh(model, resolution=0.05, progress=True)
+    save_mesh(mesh, folder / "mesh.ply")
+    scores = mesh_metrics(mesh, room_mesh(), train.hits)
+    print("mesh " + ", ".join(f"{name} {value:.4f}" for name, value in scores.items()))
+
+    render_mesh(mesh, folder / "mesh.png")
+    render_slice(model, folder / "slice.png", height=1.0)
+    print("wrote " + ", ".join(str(path) for path in sorted(folder.iterdir())))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "out"))

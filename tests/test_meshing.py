@@ -1,0 +1,236 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import nn
+
+from lardhm_torch import meshing
+from lardhm_torch.meshing import extract_mesh, save_mesh
+
+
+class GaussianMap(nn.Module):
+    """A map in a few lines: every cluster answers for every point."""
+
+    def __init__(self, centers, scale_tril, weights, origin=None):
+        super().__init__()
+        self.centers = nn.Parameter(torch.as_tensor(centers, dtype=torch.float64))
+        self.scale_tril = torch.as_tensor(scale_tril, dtype=torch.float64)
+        self.weights = nn.Parameter(torch.as_tensor(weights, dtype=torch.float64))
+        self.dim = self.centers.shape[1]
+        self.origin = torch.zeros(self.dim).double() if origin is None else origin
+        self.num_points = 0
+
+    def log_odds(self, points):
+        self.num_points += points[..., 0].numel()
+        offsets = (points - self.origin)[..., None, :] - self.centers
+        whitened = torch.linalg.solve_triangular(self.scale_tril, offsets[..., None], upper=False)
+        return torch.exp(-0.5 * whitened.square().sum(dim=(-2, -1))) @ self.weights
+
+    def forward(self, points):
+        return torch.sigmoid(self.log_odds(points))
+
+
+WEIGHT, SIGMA = 6.0, 0.3
+
+
+def ball(dim=3, origin=None):
+    return GaussianMap(torch.zeros(1, dim), SIGMA * torch.eye(dim)[None], [WEIGHT], origin)
+
+
+def ball_in_free_space(origin=None):
+    """An occupied ball inside a wide free one: both sides of its surface are measured."""
+    factors = torch.stack([SIGMA * torch.eye(3), 3 * torch.eye(3)])
+    return GaussianMap(torch.zeros(2, 3), factors, [2 * WEIGHT, -WEIGHT], origin)
+
+
+def wall_seen_from_the_left():
+    """A flat occupied cluster at x = 0 with free space on its left and nothing on its right."""
+    wall = torch.diag(torch.tensor([0.05, 1.0, 1.0]))
+    free = torch.diag(torch.tensor([0.3, 1.0, 1.0]))
+    centers = [[0.0, 0, 0], [-0.6, 0, 0]]
+    return GaussianMap(centers, torch.stack([wall, free]), [12.0, -6.0])
+
+
+def radius_where(probability):
+    """Distance from the center of `ball` at which it has this probability, in closed form."""
+    level = math.log(probability / (1 - probability))
+    return SIGMA * math.sqrt(2 * math.log(WEIGHT / level))
+
+
+def random_map(seed, clusters=12):
+    rng = torch.Generator().manual_seed(seed)
+    factors = 0.1 * torch.randn(clusters, 3, 3, generator=rng).tril(-1)
+    factors += torch.diag_embed(0.1 + 0.2 * torch.rand(clusters, 3, generator=rng))
+    weights = 5 * torch.randn(clusters, generator=rng)
+    return GaussianMap(torch.randn(clusters, 3, generator=rng), factors, weights)
+
+
+@pytest.mark.parametrize("threshold", [0.6, 0.8, 0.95])
+def test_the_mesh_of_a_ball_is_the_sphere_where_the_probability_is_the_threshold(threshold):
+    mesh = extract_mesh(ball(), 0.03, threshold, evidence=None)
+    radius = radius_where(threshold)
+    lengths = np.linalg.norm(mesh.vertices, axis=1)
+    np.testing.assert_allclose(lengths, radius, atol=0.002)  # linear between lattice points
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * radius**3, rel=0.02)
+    probability = ball()(torch.tensor(mesh.vertices)).detach()
+    torch.testing.assert_close(
+        probability, torch.full_like(probability, threshold), rtol=0, atol=0.01
+    )
+
+
+def test_normals_point_into_free_space():
+    mesh = extract_mesh(ball_in_free_space(), 0.05)
+    assert mesh.volume > 0
+    assert ((mesh.face_normals * mesh.triangles_center).sum(axis=1) > 0).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("cells", [3, 7, 20])
+def test_the_mesh_does_not_depend_on_the_blocks(seed, cells, monkeypatch):
+    model = random_map(seed)
+    monkeypatch.setattr(meshing, "BLOCK_CELLS", 200)
+    whole = extract_mesh(model, 0.08, 0.7, evidence=None)
+    monkeypatch.setattr(meshing, "BLOCK_CELLS", cells)
+    blocks = extract_mesh(model, 0.08, 0.7, evidence=None)
+    assert len(whole.faces) > 500
+    assert blocks.is_watertight == whole.is_watertight
+    assert len(blocks.vertices) == len(whole.vertices)
+    # the sets of triangles agree whatever their order
+    corners = [np.sort(m.triangles.round(5).reshape(-1, 9), axis=1) for m in (blocks, whole)]
+    np.testing.assert_allclose(*(c[np.lexsort(c.T)] for c in corners), atol=2e-5)
+    assert blocks.volume == pytest.approx(whole.volume)
+
+
+def test_only_blocks_near_occupied_clusters_are_evaluated():
+    model = GaussianMap(
+        [[0.0, 0, 0], [40.0, 40.0, 40.0]], (0.1 * torch.eye(3)).repeat(2, 1, 1), [6.0, 6.0]
+    )
+    mesh = extract_mesh(model, 0.05, 0.7, color=None, evidence=None)
+    assert mesh.body_count == 2
+    assert model.num_points < 20 * 25**3  # all blocks would be 34³ of these
+
+
+def test_the_mesh_moves_with_the_world():
+    shift = torch.tensor([5e5, 4.5e6, 100.0]).double()
+    here, there = (extract_mesh(ball_in_free_space(o), 0.05) for o in (None, shift))
+    np.testing.assert_allclose(there.vertices - shift.numpy(), here.vertices, atol=1e-6)
+    np.testing.assert_array_equal(there.faces, here.faces)
+
+
+def test_bounds_cut_the_mesh():
+    whole = extract_mesh(ball_in_free_space(), 0.05)
+    half = extract_mesh(ball_in_free_space(), 0.05, bounds=([0, -1, -1], [1, 1, 1]))
+    assert half.bounds[0, 0] == pytest.approx(0.0)
+    assert half.bounds[1, 0] == pytest.approx(whole.bounds[1, 0], abs=0.005)
+    assert half.area == pytest.approx(whole.area / 2, rel=0.02)
+
+
+def test_bounds_away_from_every_obstacle_give_a_mesh_without_faces():
+    mesh = extract_mesh(ball(), 0.05, bounds=([10, 10, 10], [11, 11, 11]))
+    assert isinstance(mesh, trimesh.Trimesh)
+    assert len(mesh.faces) == 0
+
+
+def test_a_map_that_knows_only_free_space_gives_a_mesh_without_faces():
+    free = GaussianMap(torch.zeros(1, 3), 0.3 * torch.eye(3)[None], [-6.0])
+    assert len(extract_mesh(free, 0.05).faces) == 0
+
+
+def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
+    model = wall_seen_from_the_left()
+    everything = extract_mesh(model, 0.02, evidence=None)
+    measured = extract_mesh(model, 0.02)
+    assert (everything.triangles_center[:, 0] > 0.1).any()  # the back, where only tails are left
+    assert 0 < len(measured.faces) < len(everything.faces)
+    assert measured.triangles_center[:, 0].max() < 0
+    middle = np.abs(measured.triangles_center[:, 1:]).max(axis=1) < 0.5
+    assert (measured.face_normals[middle, 0] < -0.9).all()
+
+
+def test_below_one_half_the_surface_bounds_the_known_free_space():
+    free = GaussianMap(torch.zeros(1, 3), SIGMA * torch.eye(3)[None], [-WEIGHT])
+    mesh = extract_mesh(free, 0.03, threshold=0.2, evidence=None)
+    np.testing.assert_allclose(
+        np.linalg.norm(mesh.vertices, axis=1), radius_where(0.8), atol=0.002
+    )
+    assert mesh.volume < 0  # its normals point inward, into the free space
+
+
+@pytest.mark.parametrize("color", ["height", "cluster", "probability"])
+def test_every_vertex_has_a_color(color):
+    mesh = extract_mesh(random_map(2), 0.08, 0.7, color=color, evidence=None)
+    assert mesh.visual.kind == "vertex"
+    assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 1
+
+
+def test_colors_by_cluster_and_by_probability_are_those_of_the_nearest_cluster():
+    model = GaussianMap(
+        [[-0.5, 0, 0], [0.5, 0, 0]], (0.2 * torch.eye(3)).repeat(2, 1, 1), [4.0, 8.0]
+    )
+    for color in ("cluster", "probability"):
+        mesh = extract_mesh(model, 0.05, 0.7, color=color, evidence=None)
+        left = mesh.vertices[:, 0] < 0
+        shades = [np.unique(mesh.visual.vertex_colors[side], axis=0) for side in (left, ~left)]
+        assert [len(shade) for shade in shades] == [1, 1]
+        assert (shades[0] != shades[1]).any()
+
+
+def test_without_color_the_mesh_has_none():
+    assert extract_mesh(ball_in_free_space(), 0.1, color=None).visual.kind is None
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
+def test_a_saved_mesh_is_read_back(suffix, tmp_path):
+    mesh = extract_mesh(ball_in_free_space(), 0.1)
+    save_mesh(mesh, tmp_path / f"ball{suffix}")
+    again = trimesh.load(tmp_path / f"ball{suffix}", force="mesh")
+    assert len(again.faces) == len(mesh.faces)
+    np.testing.assert_allclose(again.bounds, mesh.bounds, atol=1e-5)
+    assert [p.name for p in tmp_path.iterdir()] == [f"ball{suffix}"]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "mesh.ply"
+    path.write_text("old")
+
+    def full_disk(partial, **_):
+        partial.write_text("half")
+        raise OSError("no space left")
+
+    mesh = extract_mesh(ball_in_free_space(), 0.1)
+    monkeypatch.setattr(mesh, "export", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        save_mesh(mesh, path)
+    assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
+    assert path.read_text() == "old"
+
+
+def test_an_unknown_mesh_format_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"one of .glb, .obj, .off, .ply, .stl.*got 'a.xyz'"):
+        save_mesh(trimesh.creation.box(), tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"model": ball(dim=2)}, "a mesh needs a 3-D map; got 2-D. For 2-D use query_slice"),
+        (
+            {"model": GaussianMap(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0))},
+            "it is empty: fit it first",
+        ),
+        ({"resolution": 0.0}, "resolution must be > 0 m and finite; got 0.0"),
+        ({"resolution": math.nan}, "resolution must be > 0 m and finite; got nan"),
+        ({"threshold": 0.0}, "threshold must be between 0 and 1, both excluded; got 0.0"),
+        ({"color": "pink"}, "color must be one of height, cluster, probability, or None"),
+        ({"evidence": -1.0}, "evidence must be >= 0, or None"),
+        ({"bounds": ([1, 1, 1], [0, 0, 0])}, "lower <= upper"),
+        ({"bounds": ([0, 0], [1, 1])}, r"bounds must have 3 coordinates; got 2"),
+    ],
+)
+def test_bad_arguments_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        extract_mesh(**{"model": ball(), **changed})
