@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lardhm_torch.features import nearest_centers
+from lardhm_torch.native import nearest_centers
 
 POINTS_PER_CLUSTER = 20  # of the rule that chooses the number of clusters
 MAX_CHOSEN = 3000  # a class

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lardhm_torch import checkpoint
+from lardhm_torch import checkpoint, native
 from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances
-from lardhm_torch.features import feature_matrix, log_odds, nearest_features
+from lardhm_torch.features import feature_matrix, lard_kernel
 from lardhm_torch.fitting import FitConfig, fit_weights, keep_features
 
 CACHE_BYTES = 1 << 28  # features of the training points are kept for all passes up to this size
@@ -79,6 +79,7 @@ class LardHilbertMap(nn.Module):
         self.register_buffer("means", torch.zeros(0, dim))
         self.register_buffer("scatters", torch.zeros(0, dim, dim))
         self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
+        self._index = torch.empty(0, dtype=torch.uint8)
         self.register_load_state_dict_pre_hook(_make_room)
 
     # --- what the map knows ---
@@ -117,15 +118,24 @@ class LardHilbertMap(nn.Module):
         local = self._to_map_frame(points)
         if local.ndim != 2:
             raise ValueError(f"points must be (N, {self.dim}); got {tuple(points.shape)}")
-        state = (self.centers, self.scale_tril, self.num_neighbors)
-        indices, values = nearest_features(local, *state)
+        indices = native.nearest_centers(
+            local, self.centers, self.num_neighbors, self._fresh_index()
+        )
+        values = lard_kernel(local, self.centers, self.scale_tril, indices)
         return feature_matrix(indices, values, len(self))
 
     def _query(self, points: Tensor, probability: bool) -> Tensor:
         local = self._to_map_frame(points)
         state = (self.centers, self.scale_tril, self.weights, self.num_neighbors)
-        answer = log_odds(local.reshape(-1, self.dim), *state).reshape(local.shape[:-1])
-        return torch.sigmoid(answer) if probability else answer
+        flat = local.reshape(-1, self.dim)
+        answer = native.occupancy(flat, *state, probability=probability, index=self._fresh_index())
+        return answer.reshape(local.shape[:-1])
+
+    def _fresh_index(self) -> Tensor:
+        """The neighbor search's index, made anew whenever the centers are not those it was made of."""
+        if not native.index_matches(self._index, self.centers, self.num_neighbors):
+            self._index = native.build_index(self.centers, self.num_neighbors)
+        return self._index
 
     def _to_map_frame(self, points: Tensor) -> Tensor:
         points = torch.as_tensor(points, device=self.origin.device)
@@ -193,9 +203,12 @@ class LardHilbertMap(nn.Module):
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
     ) -> None:
         centers, scale_tril = self.centers.detach(), self.scale_tril.detach()
+        index = self._fresh_index()
 
         def features_of(rows: Tensor) -> tuple[Tensor, Tensor]:
-            return nearest_features(local[rows], centers, scale_tril, self.num_neighbors)
+            points = local[rows]
+            indices = native.nearest_centers(points, centers, self.num_neighbors, index)
+            return indices, lard_kernel(points, centers, scale_tril, indices)
 
         features = keep_features(features_of, len(local), CACHE_BYTES, local.device)
         start = self.weights.detach()

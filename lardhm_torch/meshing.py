@@ -71,13 +71,17 @@ def extract_mesh(
     lower, upper = (box[supporters].cpu() for box in cluster_boxes(model))
     if bounds is not None:
         corner, end = (torch.as_tensor(b, dtype=torch.float64).cpu() for b in bounds)
-        grid_axes(corner, end, resolution)  # raises what is wrong with them
+        if len(grid_axes(corner, end, resolution)) != 3:
+            raise ValueError(f"bounds must have 3 coordinates; got {len(corner)}")
         touching = ((upper >= corner) & (lower <= end)).all(dim=1)
         lower, upper = lower[touching].maximum(corner), upper[touching].minimum(end)
     if len(lower) == 0:
         return _to_mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     if bounds is None:
-        corner, end = lower.amin(dim=0), upper.amax(dim=0)
+        corner, end = (
+            lower.amin(dim=0),
+            upper.amax(dim=0) + resolution,
+        )  # whole cells cover the boxes
     cells = ((end - corner) / resolution + 1e-6).floor().long().clamp(min=1)
     blocks = _active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
     vertices, faces = _march_blocks(model, corner, resolution, blocks, cells, level, progress)

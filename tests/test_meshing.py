@@ -90,11 +90,11 @@ def test_normals_point_into_free_space():
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("cells", [3, 7, 20])
 def test_the_mesh_does_not_depend_on_the_blocks(seed, cells, monkeypatch):
-    model = random_map(seed)
-    monkeypatch.setattr(meshing, "BLOCK_CELLS", 200)
-    whole = extract_mesh(model, 0.08, 0.7, evidence=None)
+    model, bounds = random_map(seed), ([-1.6] * 3, [1.6] * 3)
+    monkeypatch.setattr(meshing, "BLOCK_CELLS", 40)  # all of it in one block
+    whole = extract_mesh(model, 0.08, 0.7, bounds, evidence=None)
     monkeypatch.setattr(meshing, "BLOCK_CELLS", cells)
-    blocks = extract_mesh(model, 0.08, 0.7, evidence=None)
+    blocks = extract_mesh(model, 0.08, 0.7, bounds, evidence=None)
     assert len(whole.faces) > 500
     assert blocks.is_watertight == whole.is_watertight
     assert len(blocks.vertices) == len(whole.vertices)
@@ -141,8 +141,8 @@ def test_a_map_that_knows_only_free_space_gives_a_mesh_without_faces():
 
 def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
     model = wall_seen_from_the_left()
-    everything = extract_mesh(model, 0.02, evidence=None)
-    measured = extract_mesh(model, 0.02)
+    everything = extract_mesh(model, 0.04, evidence=None)
+    measured = extract_mesh(model, 0.04)
     assert (everything.triangles_center[:, 0] > 0.1).any()  # the back, where only tails are left
     assert 0 < len(measured.faces) < len(everything.faces)
     assert measured.triangles_center[:, 0].max() < 0
@@ -153,9 +153,7 @@ def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
 def test_below_one_half_the_surface_bounds_the_known_free_space():
     free = GaussianMap(torch.zeros(1, 3), SIGMA * torch.eye(3)[None], [-WEIGHT])
     mesh = extract_mesh(free, 0.03, threshold=0.2, evidence=None)
-    np.testing.assert_allclose(
-        np.linalg.norm(mesh.vertices, axis=1), radius_where(0.8), atol=0.002
-    )
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), radius_where(0.8), atol=0.002)
     assert mesh.volume < 0  # its normals point inward, into the free space
 
 

@@ -148,7 +148,9 @@ def test_a_ray_toward_a_ball_stops_where_the_closed_form_says(threshold, shift):
         origin,
     )
     start = origin + torch.tensor([-2.0, 0, 0])
-    ranges = raycast(model, start, torch.tensor([[7.0, 0, 0], [0, 1, 0], [-1, 0, 0]]), 5.0, threshold)
+    ranges = raycast(
+        model, start, torch.tensor([[7.0, 0, 0], [0, 1, 0], [-1, 0, 0]]), 5.0, threshold
+    )
     level = math.log(threshold / (1 - threshold))
     # halfway between the two equal balls log-odds are 0; else the near one adds only its tail
     expected = 1.0 if threshold == 0.5 else 2 - radius_where(level)
@@ -168,7 +170,12 @@ def test_the_probability_at_the_end_of_a_ray_is_the_threshold_and_lower_before()
     assert met.sum() > 20
     ends = starts[met] + ranges[met, None] * directions[met]
     outside = model(starts[met]) < 0.6
-    torch.testing.assert_close(model(ends)[outside].detach(), torch.full((int(outside.sum()),), 0.6).double(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        model(ends)[outside].detach(),
+        torch.full((int(outside.sum()),), 0.6).double(),
+        rtol=0,
+        atol=1e-4,
+    )
     shares = torch.linspace(0, 1, 200, dtype=torch.float64)[:, None, None]
     before = model.log_odds(starts[met] + shares * (ends - starts[met]))
     assert (before <= math.log(0.6 / 0.4) + EVIDENCE).all()
@@ -204,7 +211,9 @@ def test_no_rays_give_no_ranges():
 
 
 def test_the_step_is_the_thickness_of_the_occupied_clusters():
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double())[0]
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double())[
+        0
+    ]
     covariance = turn @ torch.diag(torch.tensor([0.04, 1.0, 2.0]).double() ** 2) @ turn.T
     factors = torch.stack([torch.linalg.cholesky(covariance), 0.001 * torch.eye(3).double()])
     assert surface_step(GaussianMap(torch.zeros(2, 3), factors, [1.0, -1.0])) == pytest.approx(0.04)
@@ -229,11 +238,13 @@ def test_bad_grids_are_refused(arguments, message):
 def test_bad_slices_and_bounds_are_refused():
     with pytest.raises(ValueError, match="must have 3 coordinates; got 2"):
         query_grid(ball(), [0, 0], [1, 1], 0.5)
-    with pytest.raises(ValueError, match="height must be a number in 3-D and None in 2-D; got None"):
+    with pytest.raises(
+        ValueError, match="height must be a number in 3-D and None in 2-D; got None"
+    ):
         query_slice(ball())
     with pytest.raises(ValueError, match="height must be a number in 3-D and None in 2-D; got 1"):
         query_slice(ball(dim=2), height=1.0)
-    with pytest.raises(ValueError, match="2 or 3 dimensions; got 4. Use query_grid"):
+    with pytest.raises(ValueError, match=r"2 or 3 dimensions; got 4\. Use query_grid"):
         query_slice(ball(dim=4), height=1.0)
     with pytest.raises(ValueError, match="it is empty: fit it first"):
         map_bounds(GaussianMap(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0)))

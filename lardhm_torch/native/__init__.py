@@ -1,0 +1,143 @@
+"""The fast twin of `features`: the same values and gradients on the CPU, in one fused pass.
+
+Never needed for correctness: where `supports` says no, the functions here call the definition.
+Every operator checks that the index it is given was made from the very centers it is given, and
+makes its own otherwise, so a stale index costs time and never an answer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import features
+from lardhm_torch.native.build import available as library_available
+
+DIMENSIONS = (2, 3)
+DTYPES = (torch.float32, torch.float64)
+
+_registered = False
+
+
+def available() -> bool:
+    """Whether the kernel is built and loaded; the first call does both."""
+    global _registered
+    if not library_available():
+        return False
+    if not _registered:
+        _registered = True
+        _register()
+    return True
+
+
+def supports(points: Tensor) -> bool:
+    """Whether the kernel answers for (N, D) points of this device, dtype and dimension."""
+    fits = points.device.type == "cpu" and points.dtype in DTYPES
+    return fits and points.shape[-1] in DIMENSIONS and available()
+
+
+def build_index(centers: Tensor, num_neighbors: int) -> Tensor:
+    """What the search knows of (M, D) centers, as one opaque tensor; empty where it knows nothing."""
+    if not supports(centers):
+        return torch.empty(0, dtype=torch.uint8, device=centers.device)
+    return torch.ops.lardhm.build_index(centers.detach(), num_neighbors)
+
+
+def index_matches(index: Tensor, centers: Tensor, num_neighbors: int) -> bool:
+    """Whether an index was made from exactly these centers."""
+    if not supports(centers):
+        return len(index) == 0
+    return torch.ops.lardhm.index_matches(index, centers.detach(), num_neighbors)
+
+
+def nearest_centers(
+    points: Tensor, centers: Tensor, num_neighbors: int, index: Tensor | None = None
+) -> Tensor:
+    """As `features.nearest_centers`; an index saves the time to make one."""
+    if not supports(points):
+        return features.nearest_centers(points, centers, num_neighbors)
+    index = build_index(centers, num_neighbors) if index is None else index
+    return torch.ops.lardhm.nearest(points.detach(), centers.detach(), num_neighbors, index)
+
+
+def occupancy(
+    points: Tensor,
+    centers: Tensor,
+    scale_tril: Tensor,
+    weights: Tensor,
+    num_neighbors: int,
+    *,
+    probability: bool,
+    index: Tensor | None = None,
+) -> Tensor:
+    """As `features.log_odds`, or its sigmoid; an index saves the time to make one."""
+    if not supports(points):
+        answer = features.log_odds(points, centers, scale_tril, weights, num_neighbors)
+        return torch.sigmoid(answer) if probability else answer
+    index = build_index(centers, num_neighbors) if index is None else index
+    return torch.ops.lardhm.occupancy(
+        points, centers, scale_tril, weights, num_neighbors, index, probability
+    )
+
+
+def _register() -> None:
+    """Shapes for `torch.compile` and `torch.export`, and the gradient."""
+    library = torch.library
+
+    @library.register_fake("lardhm::nearest")
+    def _(points: Tensor, centers: Tensor, k: int, index: Tensor) -> Tensor:
+        return points.new_empty((points.shape[0], min(k, centers.shape[0])), dtype=torch.long)
+
+    @library.register_fake("lardhm::occupancy")
+    def _(points: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(points.shape[0])
+
+    @library.register_fake("lardhm::occupancy_backward")
+    def _(grad: Tensor, points: Tensor, centers: Tensor, scale_tril: Tensor, weights: Tensor,
+          k: int, index: Tensor, probability: bool, wanted: int) -> tuple[Tensor, ...]:  # fmt: skip
+        inputs = (points, centers, scale_tril, weights)
+        return tuple(
+            torch.empty_like(t) if wanted >> bit & 1 else t.new_empty(0)
+            for bit, t in enumerate(inputs)
+        )
+
+    @library.register_fake("lardhm::assign")
+    def _(points: Tensor, centers: Tensor, index: Tensor, scatter: bool) -> tuple[Tensor, ...]:
+        count, dim = centers.shape
+        labels = points.new_empty(points.shape[0], dtype=torch.long)
+        scatters = centers.new_empty(count if scatter else 0, dim, dim)
+        return labels, centers.new_empty(count), torch.empty_like(centers), scatters
+
+    library.register_autograd("lardhm::occupancy", _backward, setup_context=_keep_inputs)
+
+
+def _keep_inputs(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    points, centers, scale_tril, weights, ctx.num_neighbors, index, ctx.probability = inputs
+    ctx.save_for_backward(points, centers, scale_tril, weights, index)
+
+
+def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    *inputs, index = ctx.saved_tensors
+    k, probability = ctx.num_neighbors, ctx.probability
+    if torch.is_grad_enabled():  # the gradient itself is to be differentiated
+        grads = _differentiable_gradients(grad, inputs, ctx.needs_input_grad, k, index, probability)
+    else:
+        wanted = sum(1 << bit for bit in range(4) if ctx.needs_input_grad[bit])
+        computed = torch.ops.lardhm.occupancy_backward(grad, *inputs, k, index, probability, wanted)
+        grads = [g if wanted >> bit & 1 else None for bit, g in enumerate(computed)]
+    return (*grads, None, None, None)
+
+
+def _differentiable_gradients(
+    grad: Tensor, inputs: list[Tensor], needed: Any, k: int, index: Tensor, probability: bool
+) -> list[Tensor | None]:
+    points, centers, scale_tril, weights = inputs
+    indices = nearest_centers(points, centers, k, index)
+    values = features.lard_kernel(points, centers, scale_tril, indices)
+    answer = (values * weights[indices]).sum(dim=1)
+    answer = torch.sigmoid(answer) if probability else answer
+    asked = [tensor for tensor, need in zip(inputs, needed[:4], strict=True) if need]
+    found = iter(torch.autograd.grad(answer, asked, grad, create_graph=True))
+    return [next(found) if need else None for need in needed[:4]]

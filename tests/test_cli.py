@@ -1,0 +1,143 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from lardhm_torch import LardHilbertMap, Scans, load_scans, save_scans
+from lardhm_torch.cli import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A small simulated room, split, and a map of its training half."""
+    folder = tmp_path_factory.mktemp("cli")
+    run("simulate", "--rays", "6000", "-o", folder / "room.npz")
+    run("split", folder / "room.npz", "-o", folder / "train.npz", folder / "test.npz")
+    run("fit", folder / "train.npz", "-o", folder / "map.pt")
+    return folder
+
+
+def run(*words):
+    assert main([str(word) for word in words]) == 0
+
+
+def fails(capsys, *words):
+    """The one line that a verb prints when it fails."""
+    capsys.readouterr()
+    assert main([str(word) for word in words]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    return err
+
+
+def test_split_shares_the_rays_out(folder):
+    parts = [load_scans(folder / name) for name in ("train.npz", "test.npz")]
+    assert [len(part) for part in parts] == [3000, 3000]
+
+
+def test_query_answers_in_the_order_of_the_points_as_float32(folder):
+    points = load_scans(folder / "test.npz").ends
+    np.save(folder / "points.npy", points.numpy())
+    run("query", folder / "map.pt", folder / "points.npy", "-o", folder / "p.npy")
+    answer = np.load(folder / "p.npy")
+    assert answer.dtype == np.float32
+    with torch.no_grad():
+        expected = LardHilbertMap.load(folder / "map.pt")(points)
+    np.testing.assert_array_equal(answer, expected.numpy())
+
+
+def test_mesh_writes_a_surface(folder, capsys):
+    run("mesh", folder / "map.pt", "-o", folder / "mesh.ply", "--resolution", "0.1")
+    assert (folder / "mesh.ply").stat().st_size > 10_000
+    assert "faces" in capsys.readouterr().out
+
+
+def test_evaluate_prints_a_table_or_json(folder, capsys):
+    run("evaluate", folder / "map.pt", folder / "test.npz")
+    assert "balanced_accuracy" in capsys.readouterr().out
+    run("evaluate", folder / "map.pt", folder / "test.npz", "--json")
+    table = json.loads(capsys.readouterr().out)
+    assert table["unif"]["balanced_accuracy"] > 0.97
+
+
+def test_info_tells_what_the_map_holds(folder, capsys):
+    run("info", folder / "map.pt", "--json")
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["clusters"] == facts["occupied clusters"] + facts["free clusters"]
+    assert facts["dim"] == 3
+    run("info", folder / "map.pt")
+    assert "clusters" in capsys.readouterr().out
+
+
+def test_fit_takes_settings(folder):
+    options = ["--clusters", 60, "--neighbors", 4, "--seed", 3]
+    run("fit", folder / "train.npz", *options, "-o", folder / "small.pt")
+    model = LardHilbertMap.load(folder / "small.pt")
+    assert model.num_neighbors == 4
+    assert 50 <= len(model) <= 60
+
+
+def test_flat_scans_make_a_two_dimensional_map_on_request(tmp_path):
+    angle = torch.linspace(0, 6.28, 800, dtype=torch.float64)
+    ends = torch.stack([3 * angle.cos(), 2 * angle.sin(), torch.full_like(angle, 0.5)], dim=1)
+    save_scans(Scans(torch.tensor([[0.0, 0, 0.5]]), ends), tmp_path / "flat.npz")
+    run("fit", tmp_path / "flat.npz", "--dim", 2, "-o", tmp_path / "flat.pt")
+    assert LardHilbertMap.load(tmp_path / "flat.pt").dim == 2
+    run("evaluate", tmp_path / "flat.pt", tmp_path / "flat.npz")
+    run("fit", tmp_path / "flat.npz", "-o", tmp_path / "solid.pt")
+    assert LardHilbertMap.load(tmp_path / "solid.pt").dim == 3
+
+
+def test_errors_are_one_line_and_old_files_stay(folder, capsys, tmp_path):
+    (tmp_path / "broken.pt").write_bytes(b"not a map")
+    (tmp_path / "old.npy").write_bytes(b"old")
+    message = fails(capsys, "info", tmp_path / "broken.pt")
+    assert "broken.pt must be a map file" in message
+    assert "does not exist" in fails(capsys, "info", tmp_path / "none.pt")
+    flat = tmp_path / "flat.npy"
+    np.save(flat, np.zeros((4, 2)))
+    message = fails(capsys, "query", folder / "map.pt", flat, "-o", tmp_path / "old.npy")
+    assert "points must be (..., 3)" in message
+    assert (tmp_path / "old.npy").read_bytes() == b"old"
+    message = fails(capsys, "fit", folder / "train.npz", "--dim", 2, "-o", tmp_path / "m.pt")
+    assert "last coordinate must be constant" in message
+    message = fails(capsys, "fit", folder / "train.npz", "--dim", 5, "-o", tmp_path / "m.pt")
+    assert "5 coordinates; got 3" in message
+    assert not (tmp_path / "m.pt").exists()
+
+
+def test_help_needs_no_torch():
+    code = (
+        "import sys, lardhm_torch.cli as cli\n"
+        "try: cli.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'torch', 'numpy', 'sklearn'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "evaluate" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "name", ["la3dm_sim_structured/pcd", "hilbert2015_intel/scans.npz", "tdtk_dat/scans.npz"]
+)
+def test_real_scans_go_through_every_verb(data, tmp_path, capsys, name):
+    flat = ["--dim", 2] if "intel" in name else []
+    scans = load_scans(data / name)
+    if "intel" in name:
+        scans = scans.drop_constant_column()
+    keep = torch.randperm(len(scans), generator=torch.Generator().manual_seed(0))[:30000]
+    save_scans(scans.select(keep.sort().values), tmp_path / "scans.npz")
+    run("split", tmp_path / "scans.npz", "-o", tmp_path / "train.npz", tmp_path / "test.npz")
+    run("fit", tmp_path / "train.npz", *flat, "-o", tmp_path / "map.pt")
+    capsys.readouterr()
+    run("evaluate", tmp_path / "map.pt", tmp_path / "test.npz", "--json")
+    table = json.loads(capsys.readouterr().out)
+    assert table["unif"]["balanced_accuracy"] > 0.9
+    run("query", tmp_path / "map.pt", tmp_path / "test.npz", "-o", tmp_path / "p.npy")
+    run("info", tmp_path / "map.pt")
+    if not flat:
+        run("mesh", tmp_path / "map.pt", "-o", tmp_path / "m.ply", "--resolution", "0.2")
