@@ -261,6 +261,10 @@ class LardHilbertMap(nn.Module):
         state = checkpoint.load_state(path)
         try:
             settings = checkpoint.check_settings(state.get("_extra_state"))
+            if state["centers"].shape[1:] != (settings["dim"],):
+                raise ValueError(
+                    f"centers must be (M, {settings['dim']}); got {tuple(state['centers'].shape)}"
+                )
             model = cls(**settings).to(state["centers"].dtype)
             model.load_state_dict(state)
         except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:

@@ -109,12 +109,12 @@ class Scans:
             ValueError: the last column is not constant, so dropping it would lose something.
         """
         ends, origins = self.ends, self.origins
-        if len(ends):
-            spread = float(torch.cat([ends[:, -1], origins[:, -1]]).max() - ends[:, -1].min())
-            if spread > 1e-6:
-                raise ValueError(
-                    f"the last coordinate must be constant to be dropped; it spans {spread:.3g} m"
-                )
+        column = torch.cat([ends[:, -1], origins[:, -1]])
+        spread = float(column.max() - column.min()) if len(column) else 0.0
+        if not spread <= 1e-6:  # NaN is not constant either
+            raise ValueError(
+                f"the last coordinate must be constant to be dropped; it spans {spread:.3g} m"
+            )
         return Scans(origins[:, :-1], ends[:, :-1], self.scan_id, self.is_return, self.target_index)
 
 

@@ -31,7 +31,9 @@ def wall_map(dim=3, dtype=F64, **settings):
 def same_map(first, second):
     ours, theirs = first.state_dict(), second.state_dict()
     return all(
-        torch.equal(ours[k], theirs[k]) if isinstance(ours[k], torch.Tensor) else ours[k] == theirs[k]
+        torch.equal(ours[k], theirs[k])
+        if isinstance(ours[k], torch.Tensor)
+        else ours[k] == theirs[k]
         for k in ours | theirs
     )
 

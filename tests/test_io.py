@@ -272,6 +272,12 @@ def test_points_that_are_nan_are_kept_for_the_sampler_to_count(tmp_path, name):
     )
 
 
+def test_signaling_nan_is_a_nan_like_any_other(tmp_path):
+    values = np.array([[0x7F800001, 0, 0]], "<u4")
+    (tmp_path / "scan.pcd").write_bytes(pcd_header("binary", 1, size=4) + values.tobytes())
+    assert load_points(tmp_path / "scan.pcd").isnan().tolist() == [[True, False, False]]
+
+
 @pytest.mark.parametrize("name", ["ply-ascii", "ply-big", "pcd-binary", "xyz-spaces"])
 def test_files_without_z_are_2d(tmp_path, name):
     points = some_points(dim=2)
@@ -681,11 +687,13 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path, name):
         tracemalloc.stop()
 
 
-def test_an_npz_that_would_unpack_to_far_more_than_it_holds_is_refused(tmp_path):
+@pytest.mark.parametrize("at", [[20, 24], [24]])  # packed and unpacked size, or one of them
+def test_an_npz_that_promises_far_more_than_it_holds_is_refused(tmp_path, at):
     path = whole_file(tmp_path, "npz")
     content = bytearray(path.read_bytes())
-    at = content.index(b"PK\1\2")  # the directory's entry of points: its unpacked size
-    content[at + 24 : at + 28] = (2**32 - 2).to_bytes(4, "little")
+    entry = content.index(b"PK\1\2")  # of points, in the archive's directory
+    for field in at:
+        content[entry + field : entry + field + 4] = (2**32 - 2).to_bytes(4, "little")
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"points promises 4294967294 bytes; \d+ cannot hold them"):
         load_points(path)

@@ -64,14 +64,14 @@ def test_later_returns_and_beams_without_return_are_not_inserted(octomap):
     )
 
 
-def test_a_point_within_rounding_of_a_voxel_border_has_the_probability_of_its_voxel(octomap):
-    model = OctoMapBaseline(0.1).fit(wall_scan())
-    border = torch.tensor([[3.0, 0.02, 0.02]]).double()
-    beside = border.repeat(2, 1)
-    beside[:, 0] += torch.tensor([-1e-9, 1e-9])
-    free, hit = model.probability(beside).tolist()
-    assert free == pytest.approx(0.4)
-    assert hit == pytest.approx(0.7)
+def test_points_that_differ_by_less_than_float32_have_the_same_voxel(octomap):
+    ahead = wall_scan()
+    both = Scans(ahead.origins, torch.cat([ahead.ends, ahead.ends * torch.tensor([-1, 1, 1])]))
+    model = OctoMapBaseline(0.1).fit(both)
+    assert torch.equal(model.origin, torch.zeros(3, dtype=torch.float64))
+    # 3.0 m is a border between free and occupied voxels
+    beside = torch.tensor([[3 - 1e-8, 0.02, 0.02], [3 + 1e-8, 0.02, 0.02]], dtype=torch.float64)
+    assert model.probability(beside).tolist() == pytest.approx([0.7, 0.7])
 
 
 def test_it_is_evaluated_like_a_map(octomap):

@@ -274,3 +274,13 @@ def test_a_map_without_occupied_clusters_needs_a_step():
     with pytest.raises(ValueError, match="got none: give a step"):
         raycast(model, torch.zeros(3), torch.ones(1, 3), 5.0)
     assert raycast(model, torch.zeros(3), torch.ones(1, 3), 5.0, step=0.1) == math.inf
+
+
+def test_an_obstacle_wider_than_the_step_is_met_wherever_it_lies():
+    distances = torch.linspace(1.0, 40.0, 400, dtype=torch.float64)
+    starts = torch.zeros(400, 3, dtype=torch.float64)
+    starts[:, 0] = -distances
+    toward = torch.tensor([[1.0, 0, 0]]).expand(400, 3)
+    ranges = raycast(ball(), starts, toward, 50.0, threshold=0.6, step=1.0)
+    expected = distances - radius_where(math.log(0.6 / 0.4))
+    torch.testing.assert_close(ranges, expected.clamp(min=0), rtol=0, atol=1e-3)

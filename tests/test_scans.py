@@ -138,3 +138,10 @@ def test_the_seed_decides_the_split():
 def test_a_split_leaves_something_on_both_sides(ratio):
     with pytest.raises(ValueError, match="ratio must be between 0 and 1"):
         split_rays(random_scans(4), ratio)
+
+
+@pytest.mark.parametrize("origin_height", [0.0, float("nan")])
+def test_a_column_in_which_only_the_origin_differs_is_not_dropped(origin_height):
+    scans = Scans(torch.tensor([[0.0, 0.0, origin_height]]), torch.tensor([[1.0, 2.0, 1.0]]))
+    with pytest.raises(ValueError, match="last coordinate must be constant"):
+        scans.drop_constant_column()

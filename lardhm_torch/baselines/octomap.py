@@ -67,14 +67,13 @@ class OctoMapBaseline:
             raise RuntimeError("probability needs a tree; call fit(scans) first")
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points must be (N, 3); got {tuple(points.shape)}")
-        local = to_array(points.detach().cpu().double() - self.origin)
-        known = np.flatnonzero(self.tree.getLabels(local) != UNKNOWN)
+        # float32 is the library's own precision, but its single search takes float64 for the key:
+        # beside a voxel's border the two would answer for different voxels.
+        local = to_array((points.detach().cpu().double() - self.origin).float())
         probability = np.full(len(local), 0.5)
-        for row in known:  # the library answers in batches with classes only
-            # By key, as getLabels does: a search by point rounds it to float32, and at a voxel's
-            # border that can be the next voxel.
-            key = self.tree.coordToKey(local[row])
-            probability[row] = self.tree.search(key).getOccupancy()
+        for row in np.flatnonzero(self.tree.getLabels(local) != UNKNOWN):
+            # one by one: the library answers in batches with classes only
+            probability[row] = self.tree.search(local[row]).getOccupancy()
         return torch.from_numpy(probability).to(points.device)
 
     __call__ = probability

@@ -20,6 +20,7 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -119,7 +120,8 @@ def load_points(path: PathLike) -> Tensor:
 def _read(file: Path, readers: dict[str, Callable[[Path], Readout]]) -> Readout:
     """One file through the reader of its extension; whatever is wrong names the file."""
     try:
-        return readers[file.suffix.lower()](file)
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN and inf are the sampler's to count
+            return readers[file.suffix.lower()](file)
     except ImportError:
         raise
     except OSError as error:

@@ -96,10 +96,9 @@ def _optional(archive: zipfile.ZipFile, name: str) -> NDArray | None:
     if f"{name}.npy" not in archive.namelist():
         return None
     entry = archive.getinfo(f"{name}.npy")
-    if entry.file_size > _DEFLATE_RATIO * entry.compress_size + 1024:
-        raise ValueError(
-            f"{name} promises {entry.file_size} bytes; {entry.compress_size} cannot hold them"
-        )
+    held = min(entry.compress_size, os.path.getsize(str(archive.filename)) - entry.header_offset)
+    if entry.compress_size > held or entry.file_size > _DEFLATE_RATIO * held + 1024:
+        raise ValueError(f"{name} promises {entry.file_size} bytes; {held} cannot hold them")
     with archive.open(entry) as member:
         content = member.read()
     try:

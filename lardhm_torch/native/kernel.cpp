@@ -121,23 +121,28 @@ inline typename Simd<T>::I mask_of(uint32_t bits) {
   return (lane_bit & typename Simd<T>::Int(bits)) != 0;
 }
 
+// Combines the lanes of a register, half with half.
+template <class T, int Bytes, class Combine>
+inline T fold_lanes(typename Vectors<T, Bytes>::V v, const Combine& combine) {
+  if constexpr (Bytes > 16) {
+    typename Vectors<T, Bytes / 2>::V half[2];
+    std::memcpy(half, &v, Bytes);
+    return fold_lanes<T, Bytes / 2>(combine(half[0], half[1]), combine);
+  } else if constexpr (sizeof(T) == 8) {
+    return combine(v[0], v[1]);
+  } else {
+    return combine(combine(v[0], v[1]), combine(v[2], v[3]));
+  }
+}
+
 template <class T>
 inline T smallest_lane(typename Simd<T>::V v) {
-  T lanes[Simd<T>::W];
-  std::memcpy(lanes, &v, sizeof(v));
-  for (int half = Simd<T>::W / 2; half > 0; half /= 2)
-    for (int lane = 0; lane < half; ++lane)
-      lanes[lane] = lanes[lane] < lanes[lane + half] ? lanes[lane] : lanes[lane + half];
-  return lanes[0];
+  return fold_lanes<T, kRegisterBytes>(v, [](auto a, auto b) { return a < b ? a : b; });
 }
 
 template <class T>
 inline T sum_lanes(typename Simd<T>::V v) {
-  T lanes[Simd<T>::W];
-  std::memcpy(lanes, &v, sizeof(v));
-  for (int half = Simd<T>::W / 2; half > 0; half /= 2)
-    for (int lane = 0; lane < half; ++lane) lanes[lane] += lanes[lane + half];
-  return lanes[0];
+  return fold_lanes<T, kRegisterBytes>(v, [](auto a, auto b) { return a + b; });
 }
 
 template <class T>
@@ -168,12 +173,11 @@ inline typename Simd<T>::V exp_negative(typename Simd<T>::V x) {
   const V rest = (x - n * C::ln2_high) - n * C::ln2_low;
   T factorial = 1;
   for (int i = 2; i <= C::terms; ++i) factorial *= i;
-  T coefficient = 1 / factorial;
-  V y = coefficient - V{};
+  V y = 1 / factorial - V{};
 #pragma GCC unroll 16
   for (int i = C::terms; i > 0; --i) {
-    coefficient *= i;
-    y = y * rest + coefficient;
+    factorial /= i;  // exact: a factorial again
+    y = y * rest + 1 / factorial;
   }
   const V scaled = (V)((I)y + ((I)shifted << C::mantissa));
   return x < C::lowest ? V{} : scaled;
@@ -310,10 +314,38 @@ struct Box {
     }
   }
 
-  double largest_edge() const {
-    double edge = 0;
-    for (int d = 0; d < D; ++d) edge = std::max(edge, double(high[d]) - double(low[d]));
-    return edge;
+  // Takes in the finite coordinates of the rows begin .. end; false where some are not finite.
+  bool add(const T* points, int64_t begin, int64_t end, int64_t step) {
+    constexpr int kRun = 16 * D;
+    T lowest[kRun], highest[kRun], sum[kRun] = {};
+    for (int i = 0; i < kRun; ++i) lowest[i] = low[i % D], highest[i] = high[i % D];
+    for (int64_t row = begin; row < end; row += 16 * step) {
+      const T* run = points + row * D;
+      if (step > 1 || row + 16 > end) {
+        for (int64_t one = row; one < std::min(end, row + 16 * step); one += step)
+          add_run<D>(points + one * D, lowest, highest, sum);
+      } else {
+        add_run<kRun>(run, lowest, highest, sum);
+      }
+    }
+    T total = 0;
+    for (int i = 0; i < kRun; ++i) {
+      low[i % D] = std::min(low[i % D], lowest[i]);
+      high[i % D] = std::max(high[i % D], highest[i]);
+      total += sum[i];
+    }
+    return total == T(0);
+  }
+
+  template <int Run>
+  static void add_run(const T* run, T* lowest, T* highest, T* sum) {
+    const T largest = std::numeric_limits<T>::max();
+    for (int i = 0; i < Run; ++i) {
+      const T x = run[i];
+      sum[i] += x * T(0);
+      lowest[i] = x < lowest[i] && x >= -largest ? x : lowest[i];
+      highest[i] = x > highest[i] && x <= largest ? x : highest[i];
+    }
   }
 };
 
@@ -323,6 +355,30 @@ bool is_finite(const T* x, int n) {
   for (int d = 0; d < n; ++d) sum += x[d] * T(0);
   return sum == T(0);
 }
+
+// Sorts numbered items by key: an item is its key and, in the low half, its number.
+struct Sorter {
+  std::vector<uint64_t> items, other;
+  std::vector<uint32_t> histogram;
+
+  void counting_pass(int shift, int bits) {
+    const uint32_t mask = (1u << bits) - 1;
+    histogram.assign(int64_t(mask) + 2, 0);
+    for (uint64_t item : items) ++histogram[((item >> shift) & mask) + 1];
+    for (uint32_t digit = 0; digit < mask; ++digit) histogram[digit + 1] += histogram[digit];
+    other.resize(items.size());
+    for (uint64_t item : items) other[histogram[(item >> shift) & mask]++] = item;
+    items.swap(other);
+  }
+
+  void sort(int key_bits) {
+    const int passes = key_bits <= 12 ? 1 : (key_bits + 10) / 11;
+    for (int pass = 0; pass < passes; ++pass) {
+      const int shift = key_bits * pass / passes;
+      counting_pass(32 + shift, key_bits * (pass + 1) / passes - shift);
+    }
+  }
+};
 
 // Z curve: how the bits of the cells along the axes interleave, coarse cells first.
 template <int D>
@@ -358,44 +414,34 @@ struct ZCurve {
     ++bits;
   }
 
-  uint32_t key(const float* relative) const {
-    uint32_t key = 0;
+  // Items for the rows first .. first + n of points, n <= 16, keyed by their cells.
+  template <class T>
+  void make_items(const T* points, const T* low, int64_t first, int n, uint64_t* items) const {
+    int32_t cell[D][16];
     for (int d = 0; d < D; ++d) {
-      const float at = std::min(std::max(relative[d] * scale, 0.0f), float(last[d]));
-      key |= spread[d][int32_t(at)];
+      const float largest = float(last[d]);
+      float at[16] = {};
+      for (int j = 0; j < n; ++j) at[j] = float(points[(first + j) * D + d] - low[d]) * scale;
+      for (int j = 0; j < 16; ++j) {
+        at[j] = at[j] > 0 ? at[j] : 0;  // NaN, too
+        cell[d][j] = int32_t(at[j] < largest ? at[j] : largest);
+      }
     }
-    return key;
-  }
-};
-
-// One counting pass over a digit of the keys: from -> to, stable.
-void counting_pass(const uint32_t* keys, const int32_t* from, int32_t* to, int64_t n, int shift,
-                   int bits, std::vector<uint32_t>& histogram) {
-  const uint32_t mask = (1u << bits) - 1;
-  histogram.assign(int64_t(mask) + 2, 0);
-  for (int64_t i = 0; i < n; ++i) ++histogram[((keys[i] >> shift) & mask) + 1];
-  for (int64_t digit = 0; digit < int64_t(mask); ++digit) histogram[digit + 1] += histogram[digit];
-  for (int64_t i = 0; i < n; ++i) {
-    const int32_t item = from ? from[i] : int32_t(i);
-    to[histogram[(keys[item] >> shift) & mask]++] = item;
-  }
-}
-
-struct Sorter {
-  std::vector<uint32_t> keys, histogram;
-  std::vector<int32_t> order, other;
-
-  // order: the items by key, which have so many bits.
-  void sort(int64_t n, int bits) {
-    order.resize(n);
-    const int passes = bits <= 12 ? 1 : (bits + 10) / 11;
-    for (int pass = 0; pass < passes; ++pass) {
-      const int shift = bits * pass / passes, next = bits * (pass + 1) / passes;
-      if (pass > 0) order.swap(other);
-      if (pass > 0) order.resize(n);
-      counting_pass(keys.data(), pass > 0 ? other.data() : nullptr, order.data(), n, shift,
-                    next - shift, histogram);
+    for (int j = 0; j < n; ++j) {
+      uint32_t key = 0;
+      for (int d = 0; d < D; ++d) key |= spread[d][cell[d][j]];
+      items[j] = uint64_t(key) << 32 | uint64_t(j);
     }
+  }
+
+  template <class T>
+  void sort(const T* points, const T* low, int64_t n, Sorter& sorter) const {
+    sorter.items.resize(n);
+    for (int64_t i = 0; i < n; i += 16) {
+      make_items(points, low, i, int(std::min<int64_t>(16, n - i)), sorter.items.data() + i);
+      for (int64_t j = i; j < std::min(n, i + 16); ++j) sorter.items[j] += uint64_t(i);
+    }
+    sorter.sort(bits);
   }
 };
 
@@ -407,13 +453,7 @@ struct IndexBuilder {
 
   IndexBuilder(const T* centers_, int64_t count) : centers(centers_) {
     Box<T, D> box;
-    for (int64_t i = 0; i < count; ++i) {
-      if (!is_finite(centers + i * D, D)) continue;
-      for (int d = 0; d < D; ++d) {
-        box.low[d] = std::min(box.low[d], centers[i * D + d]);
-        box.high[d] = std::max(box.high[d], centers[i * D + d]);
-      }
-    }
+    box.add(centers, 0, count, 1);
     const bool any = box.low[0] <= box.high[0];
     header.magic = kMagic;
     header.count = count;
@@ -435,16 +475,12 @@ struct IndexBuilder {
   void sort_centers() {
     double edges[D];
     for (int d = 0; d < D; ++d) edges[d] = header.high[d] - header.low[d];
-    const ZCurve<D> curve(edges, double(4 * header.count + 1));
+    T low[D];
+    for (int d = 0; d < D; ++d) low[d] = T(header.low[d]);
     Sorter sorter;
-    sorter.keys.resize(header.count);
-    for (int64_t row = 0; row < header.count; ++row) {
-      float at[D];
-      for (int d = 0; d < D; ++d) at[d] = relative(row, d);
-      sorter.keys[row] = curve.key(at);
-    }
-    sorter.sort(header.count, curve.bits);
-    order = std::move(sorter.order);
+    ZCurve<D>(edges, double(4 * header.count + 1)).sort(centers, low, header.count, sorter);
+    order.resize(header.count);
+    for (int64_t rank = 0; rank < header.count; ++rank) order[rank] = int32_t(sorter.items[rank]);
   }
 
   void write(char* to) const {
@@ -622,7 +658,88 @@ struct Region {
   }
 };
 
-// A list of candidates: ranks, ascending, and their relative coordinates.
+// Lanes of `bits` set to the front; writes a whole register.
+template <class X>
+inline void compress(uint32_t bits, const X* from, X* to) {
+#if defined(LARDHM_AVX512)
+  _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(uint16_t(bits), _mm512_loadu_si512(from)));
+#else
+  for (int64_t n = 0, lane = 0; lane < kWide; ++lane) {
+    to[n] = from[lane];
+    n += (bits >> lane) & 1;
+  }
+#endif
+}
+
+inline Wide at_least_zero(Wide x) { return (Wide)vmax((WideInt)x, WideInt{}); }
+
+inline WideInt squared_as_bits(float x) {
+  const Wide squared = x * x - Wide{};
+  return (WideInt)squared;
+}
+
+// Blocks of neighboring centers, their boxes axis by axis.
+template <int D>
+struct Blocks {
+  std::vector<int32_t> block;
+  std::vector<float> low[D], high[D];
+  int64_t size = 0;
+
+  // Those of the index within the radius of the region.
+  void collect(const Index& index, const Region<D>& region, float radius) {
+    block.resize(index.block_stride + kWide);
+    for (int d = 0; d < D; ++d) {
+      low[d].resize(index.block_stride + kWide);
+      high[d].resize(index.block_stride + kWide);
+    }
+    int32_t number[kWide];
+    for (int lane = 0; lane < kWide; ++lane) number[lane] = lane;
+    const WideInt limit = squared_as_bits(radius * 1.0001f);
+    size = 0;
+    for (int64_t i = 0; i < index.blocks; i += kWide) {
+      const float* boxes = index.boxes + i;
+      uint32_t keep = within(region, boxes, index.block_stride, limit);
+      if (i + kWide > index.blocks) keep &= ~0u >> (32 - int(index.blocks - i));
+      if (keep) {
+        compress(keep, number, block.data() + size);
+        for (int d = 0; d < D; ++d) {
+          compress(keep, boxes + d * index.block_stride, low[d].data() + size);
+          compress(keep, boxes + (D + d) * index.block_stride, high[d].data() + size);
+        }
+        size += __builtin_popcount(keep);
+      }
+      for (int lane = 0; lane < kWide; ++lane) number[lane] += kWide;
+    }
+  }
+
+  static uint32_t within(const Region<D>& region, const float* boxes, int64_t stride,
+                         WideInt limit) {
+    Wide near2 = {};
+    for (int d = 0; d < D; ++d) {
+      const Wide below = load<Wide>(boxes + d * stride) - (region.middle[d] + region.half[d]);
+      const Wide above =
+          (region.middle[d] - region.half[d]) - load<Wide>(boxes + (D + d) * stride);
+      const Wide outside = at_least_zero(below > above ? below : above);
+      near2 += outside * outside;
+    }
+    return bits_le<WideInt>((WideInt)near2, limit);
+  }
+
+  uint32_t within(int64_t i, const Region<D>& region, WideInt limit) const {
+    Wide near2 = {};
+    for (int d = 0; d < D; ++d) {
+      const Wide below = load<Wide>(low[d].data() + i) - (region.middle[d] + region.half[d]);
+      const Wide above = (region.middle[d] - region.half[d]) - load<Wide>(high[d].data() + i);
+      const Wide outside = at_least_zero(below > above ? below : above);
+      near2 += outside * outside;
+    }
+    uint32_t keep = bits_le<WideInt>((WideInt)near2, limit);
+    if (i + kWide > size) keep &= ~0u >> (32 - int(size - i));
+    return keep;
+  }
+};
+
+// Centers by rank, ascending, and their coordinates relative to the corner of the centers' box.
 template <int D>
 struct Candidates {
   std::vector<int32_t> rank;
@@ -630,84 +747,71 @@ struct Candidates {
   int64_t size = 0;
 
   void reserve(int64_t n) {
-    if (int64_t(rank.size()) >= n + kWide + kBlock) return;
-    rank.resize(2 * n + kWide + kBlock);
-    for (int d = 0; d < D; ++d) at[d].resize(2 * n + kWide + kBlock);
+    if (int64_t(rank.size()) >= n + kWide) return;
+    rank.resize(2 * n + kWide);
+    for (int d = 0; d < D; ++d) at[d].resize(2 * n + kWide);
   }
 
-  // Coordinates of the ranks, the last register filled up.
-  void look_up(const Index& index) {
-    reserve(size);
+  // Members of the blocks within the radius of the region.
+  void collect(const Index& index, const Blocks<D>& blocks, const Region<D>& region,
+               float radius) {
+    const WideInt limit = squared_as_bits(radius * 1.0001f);
+    size = 0;
+    for (int64_t i = 0; i < blocks.size; i += kWide)
+      for (uint32_t keep = blocks.within(i, region, limit); keep; keep &= keep - 1) {
+        reserve(size + kBlock);
+        const int64_t first = int64_t(blocks.block[i + __builtin_ctz(keep)]) * kBlock;
+        for (int64_t rank = first; rank < first + kBlock; rank += kWide)
+          add(index, rank, region, limit);
+      }
+  }
+
+  void add(const Index& index, int64_t first, const Region<D>& region, WideInt limit) {
     const int64_t stride = index.blocks * kBlock;
-    for (int d = 0; d < D; ++d) {
-      for (int64_t i = 0; i < size; ++i) at[d][i] = index.relative[d * stride + rank[i]];
-      for (int64_t i = size; i < size + kWide; ++i) at[d][i] = std::numeric_limits<float>::max();
-    }
+    const float* from = index.relative + first;
+    uint32_t keep = within(region, from, stride, limit);
+    if (first + kWide > index.header.count)
+      keep &= first >= index.header.count ? 0 : ~0u >> (32 - int(index.header.count - first));
+    if (!keep) return;
+    int32_t number[kWide];
+    for (int lane = 0; lane < kWide; ++lane) number[lane] = int32_t(first) + lane;
+    compress(keep, number, rank.data() + size);
+    for (int d = 0; d < D; ++d) compress(keep, from + d * stride, at[d].data() + size);
+    size += __builtin_popcount(keep);
   }
-};
 
-// Appends the items whose bit is set; writes a whole register.
-inline int64_t compress(uint32_t bits, const int32_t* items, int32_t* to) {
-#if defined(LARDHM_AVX512)
-  _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(bits, _mm512_loadu_si512(items)));
-  return __builtin_popcount(bits);
-#else
-  int64_t n = 0;
-  for (int lane = 0; lane < kWide; ++lane) {
-    to[n] = items[lane];
-    n += (bits >> lane) & 1;
-  }
-  return n;
-#endif
-}
-
-template <int D>
-int64_t keep_near(const Region<D>& region, float radius, const Candidates<D>& from, int32_t* to) {
-  const float limit = radius * radius;
-  int32_t limit_bits;
-  std::memcpy(&limit_bits, &limit, 4);
-  int64_t kept = 0;
-  for (int64_t i = 0; i < from.size; i += kWide) {
+  static uint32_t within(const Region<D>& region, const float* from, int64_t stride,
+                         WideInt limit) {
     Wide near2 = {};
     for (int d = 0; d < D; ++d) {
-      const Wide offset = load<Wide>(from.at[d].data() + i) - region.middle[d];
-      const Wide inside = (Wide)((WideInt)offset & 0x7fffffff) - region.half[d];
-      const Wide outside = (Wide)vmax((WideInt)inside, WideInt{});
+      const Wide offset = load<Wide>(from + d * stride) - region.middle[d];
+      const Wide outside =
+          at_least_zero((Wide)((WideInt)offset & 0x7fffffff) - region.half[d]);
       near2 += outside * outside;
     }
-    uint32_t keep = bits_le<WideInt>((WideInt)near2, limit_bits - WideInt{});
-    if (i + kWide > from.size) keep &= ~0u >> (32 - int(from.size - i));
-    kept += compress(keep, from.rank.data() + i, to + kept);
+    return bits_le<WideInt>((WideInt)near2, limit);
   }
-  return kept;
-}
 
-// Members of the blocks of centers within the radius of the region.
-template <int D>
-void keep_blocks(const Region<D>& region, float radius, const Index& index, Candidates<D>& to,
-                 std::vector<float>& near2) {
-  const int64_t stride = index.block_stride;
-  near2.assign(index.blocks, 0);
-  for (int d = 0; d < D; ++d) {
-    const float *low = index.boxes + d * stride, *high = index.boxes + (D + d) * stride;
-    const float region_low = region.middle[d] - region.half[d];
-    const float region_high = region.middle[d] + region.half[d];
-    for (int64_t i = 0; i < index.blocks; ++i) {
-      const float near = std::max(std::max(low[i] - region_high, region_low - high[i]), 0.0f);
-      near2[i] += near * near;
+  // Ranks of those within the radius of the region; returns how many.
+  int64_t pick(const Region<D>& region, float radius, int32_t* to) const {
+    const WideInt limit = squared_as_bits(radius);
+    int64_t kept = 0;
+    for (int64_t i = 0; i < size; i += kWide) {
+      Wide near2 = {};
+      for (int d = 0; d < D; ++d) {
+        const Wide offset = load<Wide>(at[d].data() + i) - region.middle[d];
+        const Wide outside =
+            at_least_zero((Wide)((WideInt)offset & 0x7fffffff) - region.half[d]);
+        near2 += outside * outside;
+      }
+      uint32_t keep = bits_le<WideInt>((WideInt)near2, limit);
+      if (i + kWide > size) keep &= ~0u >> (32 - int(size - i));
+      compress(keep, rank.data() + i, to + kept);
+      kept += __builtin_popcount(keep);
     }
+    return kept;
   }
-  const float limit = radius * radius * 1.0001f;
-  to.size = 0;
-  for (int64_t i = 0; i < index.blocks; ++i) {
-    if (near2[i] > limit) continue;
-    to.reserve(to.size + kBlock);
-    for (int j = 0; j < kBlock; ++j) to.rank[to.size + j] = int32_t(i * kBlock + j);
-    to.size += kBlock;
-  }
-  if (to.size > 0 && to.rank[to.size - 1] >= index.header.count)
-    to.size -= index.blocks * kBlock - index.header.count;
-}
+};
 
 // ---------------------------------------------------------------------------------------------
 // Packets: neighboring points, one a lane.
@@ -765,12 +869,12 @@ KthFn<T, D> kth_distance_for(int k) {
 template <class T, int D>
 struct Scratch {
   Sorter sorter;
-  std::vector<int32_t> rows;
-  std::vector<uint32_t> key;  // of the points in sorted order
-  std::vector<T> x[D];        // their coordinates
-  Candidates<D> far, near;
+  std::vector<int32_t> order;  // of the points along the Z curve
+  std::vector<uint32_t> key;   // their keys
+  std::vector<T> x[D];         // their coordinates
+  Blocks<D> far;
+  Candidates<D> near;
   std::vector<int32_t> list;
-  std::vector<float> block_near2;
   Region<D> region, group;
   float far_radius = 0, near_radius = 0, radius = 0;  // [m] how far the lists and a packet look
   AlignedArray<typename Simd<T>::I> distance;
@@ -826,27 +930,12 @@ struct Engine {
     smallest_radius = std::max(1e-30f, 1e-4f * reach);
   }
 
-  // Box of the finite points begin .. end; false where some point is not finite.
-  bool box_of(int64_t begin, int64_t end, int64_t step, Box<T, D>& box) const {
-    T sum = 0;
-    for (int64_t row = begin; row < end; row += step)
-      for (int d = 0; d < D; ++d) {
-        const T x = points[row * D + d];
-        sum += x * T(0);
-        box.low[d] = x < box.low[d] ? x : box.low[d];
-        box.high[d] = x > box.high[d] ? x : box.high[d];
-      }
-    return sum == T(0);
-  }
-
-  // Sorts the finite points along a Z curve over their box, s.sorter.order; others are shown to
+  // Sorts the finite points along a Z curve over their box, s.sorter.items; others are shown to
   // the visitor at once. Returns how many are left.
   template <class Visitor>
   int64_t sort_points(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor& visitor) const {
     Box<T, D> box;
-    const bool all_finite = box_of(begin, end, 1, box);
-    const int64_t n = end - begin;
-    s.sorter.keys.resize(n);
+    const bool all_finite = box.add(points, begin, end, 1);
     double edges[D];
     T low[D];
     for (int d = 0; d < D; ++d) {
@@ -855,32 +944,32 @@ struct Engine {
       const T high = std::min(box.high[d], T(index.header.high[d] + 0.5 * reach));
       edges[d] = std::max(double(high) - double(low[d]), 0.0);
     }
-    const ZCurve<D> curve(edges, std::max<double>(1, double(n) / PERCELL));
-    for (int64_t i = 0; i < n; ++i) {
-      float at[D];
-      for (int d = 0; d < D; ++d) at[d] = float(points[(begin + i) * D + d] - low[d]);
-      s.sorter.keys[i] = curve.key(at);
-    }
-    s.sorter.sort(n, curve.bits);
-    if (all_finite) return n;
+    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) / PERCELL));
+    curve.sort(points + begin * D, low, end - begin, s.sorter);
+    if (all_finite) return end - begin;
     int64_t kept = 0;
-    for (int64_t i = 0; i < n; ++i) {
-      const int32_t item = s.sorter.order[i];
-      if (is_finite(points + (begin + item) * D, D))
-        s.sorter.order[kept++] = item;
+    for (uint64_t item : s.sorter.items) {
+      const int64_t row = begin + int64_t(uint32_t(item));
+      if (is_finite(points + row * D, D))
+        s.sorter.items[kept++] = item;
       else
-        visitor.invalid(begin + item);
+        visitor.invalid(row);
     }
     return kept;
   }
 
   // Points in sorted order, axis by axis, the last one again up to a full register.
   void gather(int64_t begin, int64_t n, Scratch<T, D>& s) const {
-    for (int d = 0; d < D; ++d) s.x[d].resize(n + W);
+    s.order.resize(n);
     s.key.resize(n);
-    for (int64_t i = 0; i < n; ++i) s.key[i] = s.sorter.keys[s.sorter.order[i]];
-    for (int64_t i = 0; i < n; ++i)
-      for (int d = 0; d < D; ++d) s.x[d][i] = points[(begin + s.sorter.order[i]) * D + d];
+    for (int d = 0; d < D; ++d) s.x[d].resize(n + W);
+    for (int64_t i = 0; i < n; ++i) {
+      const uint64_t item = s.sorter.items[i];
+      s.order[i] = int32_t(item);
+      s.key[i] = uint32_t(item >> 32);
+      const T* point = points + (begin + s.order[i]) * D;
+      for (int d = 0; d < D; ++d) s.x[d][i] = point[d];
+    }
     for (int d = 0; d < D; ++d)
       for (int i = 0; i < W; ++i) s.x[d][n + i] = s.x[d][n - 1];
   }
@@ -987,7 +1076,7 @@ struct Engine {
     for (int64_t end; i < stop; i = end) {
       end = cut(s.key, i, std::min<int64_t>(stop, i + W));
       packet.begin = begin;
-      packet.order = s.sorter.order.data() + i;
+      packet.order = s.order.data() + i;
       packet.lanes = int(end - i);
       for (int d = 0; d < D; ++d) packet.x[d] = load<V>(s.x[d].data() + i);
       search(packet, region_of(s, i, i + 1), s);
@@ -1001,7 +1090,7 @@ struct Engine {
     float radius = std::max(s.radius, smallest_radius);
     for (;;) {
       if (radius > s.near_radius) look_farther(1.3f * radius, s);
-      const int64_t n = keep_near(region, radius, s.near, s.list.data());
+      const int64_t n = s.near.pick(region, radius, s.list.data());
       if (n < k) {
         radius = 2 * radius;
         continue;
@@ -1020,15 +1109,10 @@ struct Engine {
   void look_farther(float radius, Scratch<T, D>& s) const {
     if (radius > s.far_radius) {
       s.far_radius = 1.3f * radius;
-      keep_blocks(s.region, s.far_radius, index, s.far, s.block_near2);
-      s.far.look_up(index);
-      s.far.size = keep_near(s.region, s.far_radius, s.far, s.far.rank.data());
-      s.far.look_up(index);
+      s.far.collect(index, s.region, s.far_radius);
     }
     s.near_radius = radius;
-    s.near.reserve(s.far.size);
-    s.near.size = keep_near(s.group, radius, s.far, s.near.rank.data());
-    s.near.look_up(index);
+    s.near.collect(index, s.far, s.group, radius);
     s.reserve_list(s.near.size);
   }
 };
@@ -1243,7 +1327,7 @@ struct CallIndex {
 template <class T, int D>
 double volume_of(const Engine<T, D>& engine, int64_t begin, int64_t end, int64_t step) {
   Box<T, D> box;
-  engine.box_of(begin, end, step, box);
+  box.add(engine.points, begin, end, step);
   double volume = 1;
   for (int d = 0; d < D; ++d)
     volume *= std::max(double(box.high[d]) - double(box.low[d]), 0.01 * engine.reach);
