@@ -43,6 +43,7 @@ def lard_hilbert_map(train: Scans, seed: int) -> Model:
     return model
 
 
+@torch.enable_grad()
 def tuned_hilbert_map(train: Scans, seed: int) -> Model:
     """The same with centers, length-scales and weights trained by backpropagation."""
     from lardhm_torch import fine_tune  # type: ignore[attr-defined]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import platform
 import subprocess
 from importlib import metadata
@@ -13,6 +14,7 @@ from typing import Any
 import torch
 
 LIBRARIES = ("torch", "numpy", "scipy", "scikit-learn", "octomap-python", "pyoctomap")
+BUSY_LOAD = 0.5  # processes running or waiting, mean of the last minute
 ROOT = Path(__file__).parents[1]
 
 
@@ -25,6 +27,7 @@ def conditions() -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: version(name) for name in ("lardhm_torch", *LIBRARIES)},
         "commit": commit(),
+        "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }
 
 
@@ -66,7 +69,15 @@ def describe(record: dict[str, Any]) -> str:
     return (
         f"{record['date']}, {record['processor']}, {record['threads']} threads, "
         f"python {record['python']}, commit {record['commit']}\n{versions}"
+        + busy(record["load_before"])
     )
+
+
+def busy(load: float | None) -> str:
+    """A warning line where others were using the machine when the run began, else nothing."""
+    if load is None or load < BUSY_LOAD:
+        return ""
+    return f"\nWARNING: load average {load:.1f} before the start; times are not to be trusted"
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -244,7 +244,7 @@ def mesh_metrics(
         both) [m]; f_score_0.05 and f_score_0.1 at those distances [m].
 
     Raises:
-        ValueError: a mesh has no faces, hits are not (H, 3), or no part of the truth was seen.
+        ValueError: a mesh has no faces, hits are not (H, 3), or no truth was seen.
     """
     from scipy.spatial import cKDTree
 
@@ -262,9 +262,12 @@ def mesh_metrics(
     scores = {"accuracy": to_truth.mean(), "completeness": to_mesh.mean()}
     scores["chamfer"] = 0.5 * (scores["accuracy"] + scores["completeness"])
     for limit in F_SCORE_LIMITS:
-        precision, recall = (to_truth < limit).mean(), (to_mesh < limit).mean()
-        scores[f"f_score_{limit}"] = 2 * precision * recall / max(precision + recall, 1e-12)
+        scores[f"f_score_{limit}"] = _f_score((to_truth < limit).mean(), (to_mesh < limit).mean())
     return {name: float(value) for name, value in scores.items()}
+
+
+def _f_score(precision: float, recall: float) -> float:
+    return 2 * precision * recall / max(precision + recall, 1e-12)
 
 
 def _sample_surface(surface: trimesh.Trimesh, num_points: int, seed: int) -> np.ndarray:

@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
-from tqdm import tqdm
-
-from lardhm_torch import native
-from lardhm_torch.fitting import balance_classes, logistic_loss
-from lardhm_torch.hilbert_map import check_samples
-
 if TYPE_CHECKING:
-    from lardhm_torch.hilbert_map import LardHilbertMap
+    pass
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,7 @@ from lardhm_torch.simulation import room_mesh
 
 
 def main(folder: Path) -> None:
+    """Write scans, map, mesh and pictures to a folder and print the scores."""
     folder.mkdir(parents=True, exist_ok=True)
 
     scans = simulate_room(seed=0)

@@ -2,14 +2,16 @@
 //
 //   log_odds(x) = sum over the k nearest centers c_m of w_m exp(-|inv(L_m) (x - c_m)|^2 / 2)
 //
-// Index: a table of equal cubes over the centers (root), each refined into an adaptive tree of 2^D
-// children where centers are dense. A leaf lists every center that can be among the k nearest of a
-// point inside it. Points are sorted by leaf; one vector register holds one packet of points of a
-// leaf. Pass 1 streams the leaf's list past the packet and keeps the k-th smallest distance; pass 2
-// evaluates the kernel of the few centers within it. Points outside the table, leaves with long
-// lists and calls without a fitting index prune blocks of neighboring centers by the packet's box.
+// Points are sorted along a Z curve over their box; each run of up to one register of neighboring
+// points is a packet. Its candidates are the centers within a radius of the packet's box, found by
+// filtering blocks of centers for a region of some thousand points, their members for a group of
+// a hundred, and those for the packet. The radius is a guess from the packet before; if the k-th
+// distance found turns out larger, the search is repeated with that distance, so the answer is
+// exact anywhere in space. Pass 1 streams the candidates past the packet and keeps the k-th smallest
+// distance; pass 2 evaluates the kernel of the few centers within it.
 //
-// Rows of the index are in rank order: the order of the centers along a Z curve.
+// The index is the centers in the order of a Z curve ("rank") with the boxes of every 16: cheap to
+// build, and independent of k.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -224,7 +226,7 @@ void run_tasks(int64_t tasks, const Work& work) {
 
 constexpr uint64_t kMagic = 0x3278656d6864724cULL;
 constexpr int kBlock = 16;        // centers in a block
-constexpr int kZCurveBits = 20;   // cells along an axis of the Z curve: 2^20
+constexpr float kFarAway = std::numeric_limits<float>::max();
 
 struct Header {
   uint64_t magic, checksum;
@@ -268,10 +270,10 @@ struct Sections {
 
 struct Index {
   Header header;
-  int64_t blocks, block_stride;
+  int64_t blocks;
   const int32_t* order;   // (M,) rank -> row of the centers
-  const float* relative;  // (D, kBlock blocks) center - low, by rank; the padding is far away
-  const float* boxes;     // (2, D, block_stride) low and high corners of the blocks
+  const float* relative;  // (blocks, D, kBlock) center - low, by rank; the padding is far away
+  const float* boxes;     // (tiles, 2, D, kBlock) low and high corners of the blocks, 16 a tile
 };
 
 Index view_of(const char* bytes) {
@@ -279,7 +281,6 @@ Index view_of(const char* bytes) {
   std::memcpy(&index.header, bytes, sizeof(Header));
   const Sections at(index.header);
   index.blocks = at.blocks;
-  index.block_stride = padded(at.blocks, kBlock);
   index.order = reinterpret_cast<const int32_t*>(bytes + at.order);
   index.relative = reinterpret_cast<const float*>(bytes + at.relative);
   index.boxes = reinterpret_cast<const float*>(bytes + at.boxes);
@@ -490,22 +491,26 @@ struct IndexBuilder {
     std::memcpy(to + at.order, order.data(), 4 * order.size());
     auto* relative_to = reinterpret_cast<float*>(to + at.relative);
     auto* boxes = reinterpret_cast<float*>(to + at.boxes);
-    const int64_t stride = at.blocks * kBlock, block_stride = padded(at.blocks, kBlock);
-    std::fill(relative_to, relative_to + stride * D, std::numeric_limits<float>::max());
-    std::fill(boxes, boxes + block_stride * D * 2, std::numeric_limits<float>::max());
-    for (int d = 0; d < D; ++d)
-      write_axis(d, relative_to + d * stride, boxes + d * block_stride,
-                 boxes + (D + d) * block_stride);
+    const int64_t tiles = padded(at.blocks, kBlock) / kBlock;
+    std::fill(relative_to, relative_to + at.blocks * kBlock * D, kFarAway);
+    std::fill(boxes, boxes + tiles * kBlock * D * 2, kFarAway);
+    for (int64_t block = 0; block < at.blocks; ++block) {
+      float* box = boxes + block / kBlock * kBlock * D * 2 + block % kBlock;
+      for (int d = 0; d < D; ++d)
+        write_axis(block, d, relative_to + (block * D + d) * kBlock, box + d * kBlock,
+                   box + (D + d) * kBlock);
+    }
   }
 
-  void write_axis(int d, float* to, float* low, float* high) const {
-    for (int64_t rank = 0; rank < header.count; ++rank) {
-      const float x = relative(order[rank], d);
-      if (std::isfinite(x)) to[rank] = x;
-      const int64_t block = rank / kBlock;
-      low[block] = rank % kBlock == 0 ? to[rank] : std::min(low[block], to[rank]);
-      high[block] = rank % kBlock == 0 ? to[rank] : std::max(high[block], to[rank]);
+  void write_axis(int64_t block, int d, float* to, float* low, float* high) const {
+    const int64_t first = block * kBlock;
+    const int members = int(std::min<int64_t>(kBlock, header.count - first));
+    for (int i = 0; i < members; ++i) {
+      const float x = relative(order[first + i], d);
+      if (std::isfinite(x)) to[i] = x;
     }
+    *low = *std::min_element(to, to + members);
+    *high = *std::max_element(to, to + members);
   }
 };
 
@@ -647,14 +652,16 @@ struct Region {
 
   template <class T>
   Region(const Box<T, D>& box, const T* origin, float reach) {
-    float largest = reach;
+    float low[D], high[D], largest = reach;
     for (int d = 0; d < D; ++d) {
-      const float low = float(box.low[d] - origin[d]), high = float(box.high[d] - origin[d]);
-      middle[d] = 0.5f * (low + high);
-      half[d] = 0.5f * (high - low);
-      largest = std::max(largest, std::max(std::abs(low), std::abs(high)));
+      low[d] = float(box.low[d] - origin[d]);
+      high[d] = float(box.high[d] - origin[d]);
+      largest = std::max(largest, std::max(std::abs(low[d]), std::abs(high[d])));
     }
-    for (int d = 0; d < D; ++d) half[d] += largest * 5e-7f;
+    for (int d = 0; d < D; ++d) {
+      middle[d] = 0.5f * (low[d] + high[d]);
+      half[d] = 0.5f * (high[d] - low[d]) + largest * 5e-7f;
+    }
   }
 };
 
@@ -678,6 +685,45 @@ inline WideInt squared_as_bits(float x) {
   return (WideInt)squared;
 }
 
+// Lanes of one register whose boxes are within the radius (squared, as bits) of the region.
+template <int D>
+inline uint32_t boxes_within(const Region<D>& region, const float* const* low,
+                             const float* const* high, WideInt limit) {
+  Wide near2 = {};
+  for (int d = 0; d < D; ++d) {
+    const Wide below = load<Wide>(low[d]) - (region.middle[d] + region.half[d]);
+    const Wide above = (region.middle[d] - region.half[d]) - load<Wide>(high[d]);
+    const Wide outside = at_least_zero(below > above ? below : above);
+    near2 += outside * outside;
+  }
+  return bits_le<WideInt>((WideInt)near2, limit);
+}
+
+// The same for single centers.
+template <int D>
+inline uint32_t centers_within(const Region<D>& region, const float* const* at, WideInt limit) {
+  Wide near2 = {};
+  for (int d = 0; d < D; ++d) {
+    const Wide offset = load<Wide>(at[d]) - region.middle[d];
+    const Wide outside = at_least_zero((Wide)((WideInt)offset & 0x7fffffff) - region.half[d]);
+    near2 += outside * outside;
+  }
+  return bits_le<WideInt>((WideInt)near2, limit);
+}
+
+// The lanes first .. first + kWide that exist among `count`.
+inline uint32_t existing(int64_t first, int64_t count) {
+  if (first >= count) return 0;
+  return ~0u >> (32 - int(std::min<int64_t>(kWide, count - first)));
+}
+
+struct Numbers {
+  int32_t lane[kWide];
+  explicit Numbers(int64_t first) {
+    for (int i = 0; i < kWide; ++i) lane[i] = int32_t(first) + i;
+  }
+};
+
 // Blocks of neighboring centers, their boxes axis by axis.
 template <int D>
 struct Blocks {
@@ -687,55 +733,36 @@ struct Blocks {
 
   // Those of the index within the radius of the region.
   void collect(const Index& index, const Region<D>& region, float radius) {
-    block.resize(index.block_stride + kWide);
+    block.resize(index.blocks + kWide);
     for (int d = 0; d < D; ++d) {
-      low[d].resize(index.block_stride + kWide);
-      high[d].resize(index.block_stride + kWide);
+      low[d].resize(index.blocks + kWide);
+      high[d].resize(index.blocks + kWide);
     }
-    int32_t number[kWide];
-    for (int lane = 0; lane < kWide; ++lane) number[lane] = lane;
     const WideInt limit = squared_as_bits(radius * 1.0001f);
     size = 0;
     for (int64_t i = 0; i < index.blocks; i += kWide) {
-      const float* boxes = index.boxes + i;
-      uint32_t keep = within(region, boxes, index.block_stride, limit);
-      if (i + kWide > index.blocks) keep &= ~0u >> (32 - int(index.blocks - i));
-      if (keep) {
-        compress(keep, number, block.data() + size);
-        for (int d = 0; d < D; ++d) {
-          compress(keep, boxes + d * index.block_stride, low[d].data() + size);
-          compress(keep, boxes + (D + d) * index.block_stride, high[d].data() + size);
-        }
-        size += __builtin_popcount(keep);
+      const float *low_at[D], *high_at[D];
+      for (int d = 0; d < D; ++d) {
+        low_at[d] = index.boxes + i / kBlock * kBlock * D * 2 + d * kBlock + i % kBlock;
+        high_at[d] = low_at[d] + D * kBlock;
       }
-      for (int lane = 0; lane < kWide; ++lane) number[lane] += kWide;
+      const uint32_t keep =
+          boxes_within(region, low_at, high_at, limit) & existing(i, index.blocks);
+      if (!keep) continue;
+      compress(keep, Numbers(i).lane, block.data() + size);
+      for (int d = 0; d < D; ++d) compress(keep, low_at[d], low[d].data() + size);
+      for (int d = 0; d < D; ++d) compress(keep, high_at[d], high[d].data() + size);
+      size += __builtin_popcount(keep);
     }
-  }
-
-  static uint32_t within(const Region<D>& region, const float* boxes, int64_t stride,
-                         WideInt limit) {
-    Wide near2 = {};
-    for (int d = 0; d < D; ++d) {
-      const Wide below = load<Wide>(boxes + d * stride) - (region.middle[d] + region.half[d]);
-      const Wide above =
-          (region.middle[d] - region.half[d]) - load<Wide>(boxes + (D + d) * stride);
-      const Wide outside = at_least_zero(below > above ? below : above);
-      near2 += outside * outside;
-    }
-    return bits_le<WideInt>((WideInt)near2, limit);
   }
 
   uint32_t within(int64_t i, const Region<D>& region, WideInt limit) const {
-    Wide near2 = {};
+    const float *low_at[D], *high_at[D];
     for (int d = 0; d < D; ++d) {
-      const Wide below = load<Wide>(low[d].data() + i) - (region.middle[d] + region.half[d]);
-      const Wide above = (region.middle[d] - region.half[d]) - load<Wide>(high[d].data() + i);
-      const Wide outside = at_least_zero(below > above ? below : above);
-      near2 += outside * outside;
+      low_at[d] = low[d].data() + i;
+      high_at[d] = high[d].data() + i;
     }
-    uint32_t keep = bits_le<WideInt>((WideInt)near2, limit);
-    if (i + kWide > size) keep &= ~0u >> (32 - int(size - i));
-    return keep;
+    return boxes_within(region, low_at, high_at, limit) & existing(i, size);
   }
 };
 
@@ -760,36 +787,22 @@ struct Candidates {
     for (int64_t i = 0; i < blocks.size; i += kWide)
       for (uint32_t keep = blocks.within(i, region, limit); keep; keep &= keep - 1) {
         reserve(size + kBlock);
-        const int64_t first = int64_t(blocks.block[i + __builtin_ctz(keep)]) * kBlock;
-        for (int64_t rank = first; rank < first + kBlock; rank += kWide)
-          add(index, rank, region, limit);
+        const int64_t block = blocks.block[i + __builtin_ctz(keep)];
+        for (int lane = 0; lane < kBlock; lane += kWide)
+          add(index, block, lane, region, limit);
       }
   }
 
-  void add(const Index& index, int64_t first, const Region<D>& region, WideInt limit) {
-    const int64_t stride = index.blocks * kBlock;
-    const float* from = index.relative + first;
-    uint32_t keep = within(region, from, stride, limit);
-    if (first + kWide > index.header.count)
-      keep &= first >= index.header.count ? 0 : ~0u >> (32 - int(index.header.count - first));
+  void add(const Index& index, int64_t block, int lane, const Region<D>& region, WideInt limit) {
+    const float* from[D];
+    for (int d = 0; d < D; ++d) from[d] = index.relative + (block * D + d) * kBlock + lane;
+    const int64_t first = block * kBlock + lane;
+    const uint32_t keep =
+        centers_within(region, from, limit) & existing(first, index.header.count);
     if (!keep) return;
-    int32_t number[kWide];
-    for (int lane = 0; lane < kWide; ++lane) number[lane] = int32_t(first) + lane;
-    compress(keep, number, rank.data() + size);
-    for (int d = 0; d < D; ++d) compress(keep, from + d * stride, at[d].data() + size);
+    compress(keep, Numbers(first).lane, rank.data() + size);
+    for (int d = 0; d < D; ++d) compress(keep, from[d], at[d].data() + size);
     size += __builtin_popcount(keep);
-  }
-
-  static uint32_t within(const Region<D>& region, const float* from, int64_t stride,
-                         WideInt limit) {
-    Wide near2 = {};
-    for (int d = 0; d < D; ++d) {
-      const Wide offset = load<Wide>(from + d * stride) - region.middle[d];
-      const Wide outside =
-          at_least_zero((Wide)((WideInt)offset & 0x7fffffff) - region.half[d]);
-      near2 += outside * outside;
-    }
-    return bits_le<WideInt>((WideInt)near2, limit);
   }
 
   // Ranks of those within the radius of the region; returns how many.
@@ -797,15 +810,9 @@ struct Candidates {
     const WideInt limit = squared_as_bits(radius);
     int64_t kept = 0;
     for (int64_t i = 0; i < size; i += kWide) {
-      Wide near2 = {};
-      for (int d = 0; d < D; ++d) {
-        const Wide offset = load<Wide>(at[d].data() + i) - region.middle[d];
-        const Wide outside =
-            at_least_zero((Wide)((WideInt)offset & 0x7fffffff) - region.half[d]);
-        near2 += outside * outside;
-      }
-      uint32_t keep = bits_le<WideInt>((WideInt)near2, limit);
-      if (i + kWide > size) keep &= ~0u >> (32 - int(size - i));
+      const float* from[D];
+      for (int d = 0; d < D; ++d) from[d] = at[d].data() + i;
+      const uint32_t keep = centers_within(region, from, limit) & existing(i, size);
       compress(keep, rank.data() + i, to + kept);
       kept += __builtin_popcount(keep);
     }
@@ -832,8 +839,21 @@ struct Selection {
   int64_t size = 0;
 };
 
+// A product that is rounded before it is added to anything.
+template <class V>
+inline V rounded(V product) {
+#if defined(__x86_64__)
+  asm("" : "+v"(product));
+#elif defined(__aarch64__)
+  asm("" : "+w"(product));
+#else
+  asm("" : "+m"(product));
+#endif
+  return product;
+}
+
 // Squared distances of the packet to the listed centers (as bits, in `distance`); their k-th
-// smallest, lane by lane.
+// smallest, lane by lane. Every step is rounded as in the definition, so that ties are the same.
 template <class T, int D, int K>
 typename Simd<T>::I kth_distance(const Packet<T, D>& packet, const T* positions,
                                  const int32_t* list, int64_t n, int k,
@@ -846,7 +866,7 @@ typename Simd<T>::I kth_distance(const Packet<T, D>& packet, const T* positions,
     V squared = {};
     for (int d = 0; d < D; ++d) {
       const V offset = packet.x[d] - center[d];
-      squared = d == 0 ? offset * offset : squared + offset * offset;
+      squared = d == 0 ? rounded(offset * offset) : squared + rounded(offset * offset);
     }
     distance[i] = (I)squared;
     smallest.insert((I)squared);
@@ -869,12 +889,12 @@ KthFn<T, D> kth_distance_for(int k) {
 template <class T, int D>
 struct Scratch {
   Sorter sorter;
-  std::vector<int32_t> order;  // of the points along the Z curve
-  std::vector<uint32_t> key;   // their keys
+  std::vector<int32_t> order;  // of a region's points along the Z curve
   std::vector<T> x[D];         // their coordinates
   Blocks<D> far;
   Candidates<D> near;
   std::vector<int32_t> list;
+  std::vector<uint32_t> bits;  // lanes that select each of the list
   Region<D> region, group;
   float far_radius = 0, near_radius = 0, radius = 0;  // [m] how far the lists and a packet look
   AlignedArray<typename Simd<T>::I> distance;
@@ -886,25 +906,15 @@ struct Scratch {
     room = 2 * n;
     list.resize(room + kWide);
     distance.allocate(room);
-    selected.rank.resize(room);
-    selected.bits.resize(room);
+    bits.resize(room + kWide);
+    selected.rank.resize(room + kWide);
+    selected.bits.resize(room + kWide);
   }
 };
 
-#ifndef CUT
-#define CUT 2
-#endif
-#ifndef SUPER
-#define SUPER 2048
-#endif
-#ifndef GROUP
-#define GROUP 128
-#endif
-#ifndef PERCELL
-#define PERCELL 4
-#endif
-constexpr int64_t kRegionPoints = SUPER;  // sorted points that share a list of candidates
-constexpr int64_t kGroupPoints = GROUP;    // and a shorter one
+constexpr int64_t kRegionPoints = 2048;  // sorted points that share a list of candidates
+constexpr int64_t kGroupPoints = 128;    // and a shorter one
+constexpr double kPointsPerCell = 4;     // of the Z curve
 
 template <class T, int D>
 struct Engine {
@@ -944,7 +954,7 @@ struct Engine {
       const T high = std::min(box.high[d], T(index.header.high[d] + 0.5 * reach));
       edges[d] = std::max(double(high) - double(low[d]), 0.0);
     }
-    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) / PERCELL));
+    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) / kPointsPerCell));
     curve.sort(points + begin * D, low, end - begin, s.sorter);
     if (all_finite) return end - begin;
     int64_t kept = 0;
@@ -958,15 +968,15 @@ struct Engine {
     return kept;
   }
 
-  // Points in sorted order, axis by axis, the last one again up to a full register.
-  void gather(int64_t begin, int64_t n, Scratch<T, D>& s) const {
-    s.order.resize(n);
-    s.key.resize(n);
-    for (int d = 0; d < D; ++d) s.x[d].resize(n + W);
+  // Sorted points first .. stop axis by axis, the last one again up to a full register.
+  void gather(int64_t begin, int64_t first, int64_t stop, Scratch<T, D>& s) const {
+    constexpr int64_t kAhead = 24;
+    const int64_t n = stop - first, last = int64_t(s.sorter.items.size()) - 1;
+    const uint64_t* items = s.sorter.items.data();
     for (int64_t i = 0; i < n; ++i) {
-      const uint64_t item = s.sorter.items[i];
-      s.order[i] = int32_t(item);
-      s.key[i] = uint32_t(item >> 32);
+      __builtin_prefetch(
+          points + (begin + uint32_t(items[std::min(first + i + kAhead, last)])) * D);
+      s.order[i] = int32_t(items[first + i]);
       const T* point = points + (begin + s.order[i]) * D;
       for (int d = 0; d < D; ++d) s.x[d][i] = point[d];
     }
@@ -976,16 +986,17 @@ struct Engine {
 
   // Where the run of sorted points i .. stop should end: not across a border of the Z curve's cells
   // whose cell holds many more points, for the curve jumps there and the run's box would be large.
-  static int64_t cut(const std::vector<uint32_t>& key, int64_t i, int64_t stop) {
-    const int64_t n = key.size(), around = CUT * (stop - i);
-    while (key[i] != key[stop - 1]) {
-      const int bit = 31 - __builtin_clz(key[i] ^ key[stop - 1]);
-      const uint32_t cell = key[i] >> (bit + 1);
-      const bool crowded = (i >= around && key[i - around] >> (bit + 1) == cell) ||
-                           (stop - 1 + around < n && key[stop - 1 + around] >> (bit + 1) == cell);
+  static int64_t cut(const std::vector<uint64_t>& items, int64_t n, int64_t i, int64_t stop) {
+    const int64_t around = 2 * (stop - i);
+    const auto key = [&items](int64_t at) { return uint32_t(items[at] >> 32); };
+    while (key(i) != key(stop - 1)) {
+      const int bit = 31 - __builtin_clz(key(i) ^ key(stop - 1));
+      const uint32_t cell = key(i) >> (bit + 1);
+      const bool crowded = (i >= around && key(i - around) >> (bit + 1) == cell) ||
+                           (stop - 1 + around < n && key(stop - 1 + around) >> (bit + 1) == cell);
       if (!crowded) break;
-      const uint32_t border = key[stop - 1] >> bit << bit;
-      stop = std::lower_bound(key.begin() + i, key.begin() + stop, border) - key.begin();
+      const uint64_t border = uint64_t(key(stop - 1) >> bit << bit) << 32;
+      stop = std::lower_bound(items.begin() + i, items.begin() + stop, border) - items.begin();
     }
     return stop;
   }
@@ -1007,41 +1018,40 @@ struct Engine {
 
   // Fills s.selected with the listed centers within the limit, k in each lane; ties go to the lower
   // row of the centers.
-  void select(const Packet<T, D>& packet, I limit, const int32_t* list, int64_t n,
-              Scratch<T, D>& s) const {
+  void select(const Packet<T, D>& packet, I limit, int64_t n, Scratch<T, D>& s) const {
     const uint32_t all = ~0u >> (32 - packet.lanes);
-    Selection& selected = s.selected;
-    int64_t size = 0, total = 0;
+    I count = {};
     for (int64_t i = 0; i < n; ++i) {
-      const uint32_t bits = bits_le<I>(s.distance.data[i], limit) & all;
-      selected.rank[size] = int32_t(i);
-      selected.bits[size] = bits;
-      size += bits != 0;
-      total += __builtin_popcount(bits);
+      const I distance = s.distance.data[i];
+      s.bits[i] = bits_le<I>(distance, limit) & all;
+      count -= distance <= limit;
     }
-    selected.size = size;
-    if (total != int64_t(packet.lanes) * k) break_ties(packet.lanes, limit, list, s);
-    for (int64_t j = 0; j < size; ++j) selected.rank[j] = list[selected.rank[j]];
+    const typename Simd<T>::Int most = k;
+    if ((bits_le<I>(count, most - I{}) & all) != all) break_ties(packet.lanes, limit, n, s);
+    s.selected.size = 0;
+    for (int64_t i = 0; i < n; i += kWide) {
+      uint32_t some = ~bits_le<WideInt>(load<WideInt>(s.bits.data() + i), WideInt{});
+      some &= existing(i, n);
+      compress(some, s.list.data() + i, s.selected.rank.data() + s.selected.size);
+      compress(some, s.bits.data() + i, s.selected.bits.data() + s.selected.size);
+      s.selected.size += __builtin_popcount(some);
+    }
   }
 
   // Of the candidates at exactly the k-th distance of a lane, keeps those of the lowest rows.
-  void break_ties(int lanes, I limit, const int32_t* list, Scratch<T, D>& s) const {
-    Selection& selected = s.selected;
+  void break_ties(int lanes, I limit, int64_t n, Scratch<T, D>& s) const {
     std::vector<std::pair<int32_t, int64_t>> tied;
     for (int lane = 0; lane < lanes; ++lane) {
       int nearer = 0;
       tied.clear();
-      for (int64_t j = 0; j < selected.size; ++j) {
-        if (!((selected.bits[j] >> lane) & 1)) continue;
-        if (s.distance.data[selected.rank[j]][lane] < limit[lane])
-          ++nearer;
-        else
-          tied.emplace_back(index.order[list[selected.rank[j]]], j);
+      for (int64_t i = 0; i < n; ++i) {
+        if (s.distance.data[i][lane] < limit[lane]) ++nearer;
+        if (s.distance.data[i][lane] == limit[lane])
+          tied.emplace_back(index.order[s.list[i]], i);
       }
-      if (nearer + int(tied.size()) <= k) continue;
       std::sort(tied.begin(), tied.end());
       for (size_t i = size_t(k - nearer); i < tied.size(); ++i)
-        selected.bits[tied[i].second] &= ~(1u << lane);
+        s.bits[tied[i].second] &= ~(1u << lane);
     }
   }
 
@@ -1050,17 +1060,18 @@ struct Engine {
   template <class Visitor>
   void visit(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor& visitor) const {
     const int64_t n = sort_points(begin, end, s, visitor);
-    if (n == 0) return;
-    gather(begin, n, s);
+    s.order.resize(kRegionPoints);
+    for (int d = 0; d < D; ++d) s.x[d].resize(kRegionPoints + W);
     for (int64_t i = 0, stop; i < n; i = stop) {
-      stop = cut(s.key, i, std::min(n, i + kRegionPoints));
-      s.region = region_of(s, i, stop);
-      s.far_radius = s.near_radius = -1;
+      stop = cut(s.sorter.items, n, i, std::min(n, i + kRegionPoints));
+      gather(begin, i, stop, s);
+      s.region = region_of(s, 0, stop - i);
+      s.far_radius = -1;
       for (int64_t j = i, end; j < stop; j = end) {
-        end = cut(s.key, j, std::min(stop, j + kGroupPoints));
-        s.group = region_of(s, j, end);
+        end = cut(s.sorter.items, n, j, std::min(stop, j + kGroupPoints));
+        s.group = region_of(s, j - i, end - i);
         s.near_radius = -1;
-        visit_group(begin, j, end, s, visitor);
+        visit_group(begin, n, i, j, end, s, visitor);
       }
     }
   }
@@ -1069,17 +1080,18 @@ struct Engine {
     return Region<D>(box_of_sorted(s, begin, end), origin, reach);
   }
 
+  // The sorted points i .. stop of the region that begins at `first`.
   template <class Visitor>
-  void visit_group(int64_t begin, int64_t i, int64_t stop, Scratch<T, D>& s,
-                   Visitor& visitor) const {
+  void visit_group(int64_t begin, int64_t n, int64_t first, int64_t i, int64_t stop,
+                   Scratch<T, D>& s, Visitor& visitor) const {
     Packet<T, D> packet;
     for (int64_t end; i < stop; i = end) {
-      end = cut(s.key, i, std::min<int64_t>(stop, i + W));
+      end = cut(s.sorter.items, n, i, std::min<int64_t>(stop, i + W));
       packet.begin = begin;
-      packet.order = s.order.data() + i;
+      packet.order = s.order.data() + (i - first);
       packet.lanes = int(end - i);
-      for (int d = 0; d < D; ++d) packet.x[d] = load<V>(s.x[d].data() + i);
-      search(packet, region_of(s, i, i + 1), s);
+      for (int d = 0; d < D; ++d) packet.x[d] = load<V>(s.x[d].data() + (i - first));
+      search(packet, region_of(s, i - first, i - first + 1), s);
       visitor.packet(packet, s.selected);
     }
   }
@@ -1099,7 +1111,7 @@ struct Engine {
       const float farthest = std::sqrt(float(-smallest_lane<T>(-(V)limit))) * 1.00001f;
       if (farthest <= radius) {
         s.radius = farthest * 1.15f;
-        return select(packet, limit, s.list.data(), n, s);
+        return select(packet, limit, n, s);
       }
       radius = farthest;
     }
@@ -1664,7 +1676,7 @@ Gradients assign(const Tensor& given_points, const Tensor& given_centers,
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY(lardhm, m) {
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
   m.def("build_index(Tensor centers, int k) -> Tensor");
   m.def("index_matches(Tensor index, Tensor centers, int k) -> bool");
   m.def("nearest(Tensor points, Tensor centers, int k, Tensor index) -> Tensor");
