@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from lardhm_torch.sampling import Samples, SamplingConfig, sample_rays
     from lardhm_torch.scans import Scans, split_rays
     from lardhm_torch.simulation import simulate_room
+    from lardhm_torch.tuning import TuneConfig, fine_tune
 
 _ROOM_OF = {
     "FitConfig": "fitting",
@@ -21,7 +22,9 @@ _ROOM_OF = {
     "Samples": "sampling",
     "SamplingConfig": "sampling",
     "Scans": "scans",
+    "TuneConfig": "tuning",
     "extract_mesh": "meshing",
+    "fine_tune": "tuning",
     "grid": "querying",
     "load_scans": "io",
     "raycast": "querying",
@@ -37,7 +40,9 @@ __all__ = [
     "Samples",
     "SamplingConfig",
     "Scans",
+    "TuneConfig",
     "extract_mesh",
+    "fine_tune",
     "grid",
     "load_scans",
     "raycast",

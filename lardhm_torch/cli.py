@@ -51,7 +51,7 @@ def split(arguments: argparse.Namespace) -> None:
 
 def fit(arguments: argparse.Namespace) -> None:
     """Scans to a map."""
-    from lardhm_torch import LardHilbertMap, sample_rays
+    from lardhm_torch import LardHilbertMap, fine_tune, sample_rays
 
     scans = _load_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
@@ -61,6 +61,15 @@ def fit(arguments: argparse.Namespace) -> None:
     model.fit(
         samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True
     )
+    if arguments.tune:
+        fine_tune(
+            model,
+            samples.points,
+            samples.labels,
+            ray_id=samples.ray_id,
+            seed=arguments.seed,
+            progress=True,
+        )
     model.save(arguments.output)
     hits = int(samples.labels.sum())
     print(
@@ -205,6 +214,7 @@ def _scan_verbs(verb: Any) -> None:
     _output(sub)
     sub.add_argument("--clusters", type=int, help="total number (chosen from the data)")
     sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
+    sub.add_argument("--tune", action="store_true", help="also learn centers and length-scales")
     sub.add_argument("--dim", type=int, help="2 drops a constant last column")
     _seed(sub)
 

@@ -91,10 +91,13 @@ class LardHilbertMap(nn.Module):
     @property
     def scale_tril(self) -> Tensor:
         """(M, D, D) lower Cholesky factors of the kernels [m]: covariance scale and floor included."""
-        lower = self.raw_scale_tril.tril(-1)
-        diagonal = self.raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
-        lower = lower + torch.diag_embed(diagonal.clamp(min=self.min_lengthscale))
-        return self.covariance_scale**0.5 * lower
+        return self.kernel_factors(self.raw_scale_tril)
+
+    def kernel_factors(self, raw_scale_tril: Tensor) -> Tensor:
+        """(M, D, D) raw factors -> kernel factors [m], with this map's scale and floor."""
+        diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
+        diagonal = torch.diag_embed(diagonal.clamp(min=self.min_lengthscale))
+        return self.covariance_scale**0.5 * (raw_scale_tril.tril(-1) + diagonal)
 
     def extra_repr(self) -> str:
         """What `print(model)` shows."""

@@ -43,7 +43,7 @@ def main(folder: Path) -> None:
     scores = mesh_metrics(mesh, room_mesh(), train.hits)
     print("mesh " + ", ".join(f"{name} {value:.4f}" for name, value in scores.items()))
 
-    render_mesh(mesh, folder / "mesh.png")
+    render_mesh(mesh, folder / "mesh.png", cut_above=2.3)  # without the ceiling
     render_slice(model, folder / "slice.png", height=1.0)
     print("wrote " + ", ".join(str(path) for path in sorted(folder.iterdir())))
 

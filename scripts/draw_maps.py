@@ -1,34 +1,39 @@
 """The pictures of the README: fit a map to real scans, mesh it, draw it.
 
-Usage: python scripts/draw_maps.py SCANS [SCANS ...] -o docs/pictures [--resolution 0.05]
-Each SCANS is one file or folder; the picture takes the name of its folder.
+Usage: python scripts/draw_maps.py DATA [-o docs/pictures]
+DATA is the folder that holds one folder for each set, with its `scans.npz`.
 """
 
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 from lardhm_torch import LardHilbertMap, extract_mesh, load_scans, sample_rays
 from lardhm_torch.rendering import render_mesh
 
+VIEWS: dict[str, dict[str, Any]] = {  # 7-Scenes is in the frame of its first camera: -y is up
+    "sevenscenes_rgbd": {"up": (0, -1, 0), "azimuth": -105, "elevation": 25},
+    "riegl_vz400i_rtls": {"elevation": 25},
+    "balm_realworld": {"elevation": 50, "cut_above": 6.0},
+}
+RESOLUTION = {"sevenscenes_rgbd": 0.03, "riegl_vz400i_rtls": 0.06, "balm_realworld": 0.15}  # [m]
+
 
 def main() -> None:
-    """One picture for each of the scans named on the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scans", nargs="+", type=Path)
+    """One picture for each set."""
+    parser = argparse.ArgumentParser(description="Draw the maps of real scans.")
+    parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/pictures"))
-    parser.add_argument("--resolution", type=float, default=0.05)
-    parser.add_argument("--elevation", type=float, default=35.0)
-    parser.add_argument("--azimuth", type=float, default=-60.0)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
-    for path in arguments.scans:
+    for name, view in VIEWS.items():
         started = time.perf_counter()
-        samples = sample_rays(load_scans(path))
+        samples = sample_rays(load_scans(arguments.data / name / "scans.npz"))
         model = LardHilbertMap().fit(samples.points, samples.labels)
-        mesh = extract_mesh(model, arguments.resolution)
-        picture = arguments.output / f"{(path if path.is_dir() else path.parent).name}.png"
-        render_mesh(mesh, picture, azimuth=arguments.azimuth, elevation=arguments.elevation)
+        mesh = extract_mesh(model, RESOLUTION[name])
+        picture = arguments.output / f"{name}.png"
+        render_mesh(mesh, picture, size=(900, 600), **view)
         print(f"{picture}: {len(mesh.faces)} faces, {time.perf_counter() - started:.1f} s")
 
 

@@ -245,8 +245,8 @@ def test_a_fit_that_fails_half_way_leaves_the_map_as_it_was(monkeypatch):
     [
         (torch.ones(1, 3), torch.ones(1), 1),
         (torch.ones(50, 3), torch.ones(50), 1),
-        (torch.randn(100, 3), torch.zeros(100), 20),
-        (torch.randn(7, 3), torch.tensor([1.0, 0, 0, 0, 0, 0, 0]), 2),
+        (torch.rand(100, 3), torch.zeros(100), 20),
+        (torch.eye(7, 3) + torch.arange(7.0)[:, None], torch.eye(7)[0], 2),
     ],
     ids=["one point", "all points equal", "only one class", "a lone hit"],
 )

@@ -82,9 +82,46 @@ def occupancy(
     )
 
 
+def assign(
+    points: Tensor, centers: Tensor, *, scatter: bool = True
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Every point to its nearest center, and the moments of the offsets, in one pass.
+
+    Args:
+        points: (N, D) positions [m]; one that is not finite belongs to no center.
+        centers: (M, D) cluster centers [m], at least one.
+        scatter: whether to sum the products of the offsets, too.
+
+    Returns:
+        (N,) int64 labels, -1 for a point that is not finite; (M,) counts; (M, D) sums of the
+        offsets from the own center [m]; (M, D, D) sums of their outer products [m^2], or
+        (0, D, D) without ``scatter``. Sums are taken in float64.
+    """
+    if supports(points):
+        index = build_index(centers, 1)
+        return torch.ops.lardhm.assign(points.detach(), centers.detach(), index, scatter)
+    finite = points.isfinite().all(dim=1)
+    owners = features.nearest_centers(points[finite], centers, 1).squeeze(1)
+    offsets = (points[finite] - centers[owners]).double()
+    sums = torch.zeros_like(centers, dtype=torch.float64).index_add_(0, owners, offsets)
+    scatters = sums.new_zeros(len(centers) if scatter else 0, *centers.shape[1:] * 2)
+    if scatter:
+        scatters.index_add_(0, owners, offsets[:, :, None] * offsets[:, None])
+    labels = torch.full((len(points),), -1, dtype=torch.long, device=points.device)
+    labels[finite] = owners
+    counts = torch.bincount(owners, minlength=len(centers))
+    dtype = centers.dtype
+    return labels, counts.to(dtype), sums.to(dtype), scatters.to(dtype)
+
+
 def _register() -> None:
     """Shapes for `torch.compile` and `torch.export`, and the gradient."""
     library = torch.library
+
+    @library.register_fake("lardhm::build_index")
+    def _(centers: Tensor, k: int) -> Tensor:
+        size = library.get_ctx().new_dynamic_size()
+        return centers.new_empty(size, dtype=torch.uint8)
 
     @library.register_fake("lardhm::nearest")
     def _(points: Tensor, centers: Tensor, k: int, index: Tensor) -> Tensor:

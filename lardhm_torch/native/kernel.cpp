@@ -486,6 +486,7 @@ struct IndexBuilder {
 
   void write(char* to) const {
     const Sections at(header);
+    std::memset(to, 0, at.end);  // gaps, too: equal centers give equal bytes
     std::memcpy(to, &header, sizeof(Header));
     std::memcpy(to + at.centers, centers, sizeof(T) * D * header.count);
     std::memcpy(to + at.order, order.data(), 4 * order.size());
@@ -658,9 +659,11 @@ struct Region {
       high[d] = float(box.high[d] - origin[d]);
       largest = std::max(largest, std::max(std::abs(low[d]), std::abs(high[d])));
     }
+    const bool countable = largest < 1e18f;  // squares of distances are finite; else keep all
     for (int d = 0; d < D; ++d) {
-      middle[d] = 0.5f * (low[d] + high[d]);
-      half[d] = 0.5f * (high[d] - low[d]) + largest * 5e-7f;
+      middle[d] = countable ? 0.5f * (low[d] + high[d]) : 0.0f;
+      half[d] = countable ? 0.5f * (high[d] - low[d]) + largest * 5e-7f
+                          : std::numeric_limits<float>::infinity();
     }
   }
 };
@@ -937,7 +940,7 @@ struct Engine {
       origin[d] = T(index.header.low[d]);
       reach = std::max(reach, float(index.header.high[d] - index.header.low[d]));
     }
-    smallest_radius = std::max(1e-30f, 1e-4f * reach);
+    smallest_radius = std::max(1e-18f, 1e-4f * reach);
   }
 
   // Sorts the finite points along a Z curve over their box, s.sorter.items; others are shown to
