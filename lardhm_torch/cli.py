@@ -87,8 +87,11 @@ def query(arguments: argparse.Namespace) -> None:
     from lardhm_torch.io import load_points
 
     model = LardHilbertMap.load(arguments.map)
+    points = load_points(arguments.points)
+    if points.shape[1] == model.dim + 1 and bool((points[:, -1] == points[:1, -1]).all()):
+        points = points[:, :-1]  # flat scans, as `fit --dim 2` takes them
     with torch.no_grad():
-        probability = model(load_points(arguments.points)).float().numpy()
+        probability = model(points).float().numpy()
     _write_atomically(arguments.output, lambda file: np.save(file, probability))
     print(f"{len(probability)} probabilities -> {arguments.output}")
 

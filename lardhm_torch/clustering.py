@@ -15,6 +15,7 @@ from lardhm_torch.native import nearest_centers
 
 POINTS_PER_CLUSTER = 20  # of the rule that chooses the number of clusters
 MAX_CHOSEN = 3000  # a class
+START_POINTS = 100  # a center, drawn at random, among which the start is chosen
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
@@ -162,6 +163,9 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     where points are sparse they are picked more often than their number says. Inertia is least
     at a density of centers between that of the points and uniform, and starts near it.
     """
+    count = START_POINTS * num_clusters
+    if len(points) > count:
+        points = points[torch.randint(len(points), (count,), generator=rng, device=rng.device)]
     ordered = points[z_order(points).argsort(stable=True)]
     if num_clusters >= len(points):
         return ordered
@@ -178,7 +182,7 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
 
 def z_order(points: Tensor) -> Tensor:
     """(N, D) positions -> (N,) place along a space-filling curve (Morton code), int64."""
-    bits = min(16, 62 // points.shape[1])
+    bits = min(10, 62 // points.shape[1])
     lower, upper = points.amin(dim=0), points.amax(dim=0)
     edge = (upper - lower).max().clamp(min=torch.finfo(points.dtype).tiny)
     cells = ((points - lower) / edge * (2**bits - 1)).long()

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lardhm_torch import native
+
 FEATURE_CHUNK = 1 << 17  # points whose features are computed at a time
+State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the slope
 FeaturesOf = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
@@ -42,9 +46,20 @@ class FitConfig:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
 
+class KeptFeatures(NamedTuple):
+    """Features of all points: (N, K) indices and kernel values; called with rows, those of them."""
+
+    indices: Tensor
+    values: Tensor
+
+    def __call__(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows (B,) -> indices (B, K) and kernel values (B, K)."""
+        return self.indices[rows], self.values[rows]
+
+
 def keep_features(
     features_of: FeaturesOf, num_points: int, num_bytes: int, device: torch.device
-) -> FeaturesOf:
+) -> FeaturesOf | KeptFeatures:
     """The same features, computed once and kept if that takes at most ``num_bytes``.
 
     Args:
@@ -59,9 +74,9 @@ def keep_features(
         return features_of
     chunks = torch.arange(num_points, device=device).split(FEATURE_CHUNK)
     parts = [features_of(chunk) for chunk in chunks]
-    indices = torch.cat([part[0] for part in parts])
-    values = torch.cat([part[1] for part in parts])
-    return lambda rows: (indices[rows], values[rows])
+    return KeptFeatures(
+        torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+    )
 
 
 def balance_classes(labels: Tensor) -> Tensor:
@@ -86,7 +101,7 @@ def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
 
 
 def fit_weights(
-    features_of: FeaturesOf,
+    features_of: FeaturesOf | KeptFeatures,
     labels: Tensor,
     weights: Tensor,
     config: FitConfig,
@@ -112,23 +127,64 @@ def fit_weights(
 
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
-    weights = weights.clone()
     factors = balance_classes(labels) if config.balance else torch.ones_like(labels)
     batch_size = config.batch_size or max(256, len(labels) // 128)
-    total_steps = config.passes * -(-len(labels) // batch_size)
-    step = 0
-    state = (torch.zeros_like(weights), torch.zeros_like(weights))
-    for _ in tqdm(range(config.passes), "weights", disable=None if progress else True):
+    plan = _Plan(config, batch_size, config.passes * -(-len(labels) // batch_size))
+    kept = features_of if isinstance(features_of, KeptFeatures) else None
+    if kept is not None and not native.descends(kept.values):
+        kept = None
+    state = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights))
+    for number in tqdm(range(config.passes), "weights", disable=None if progress else True):
         order = torch.randperm(len(labels), generator=rng, device=rng.device)
-        for rows in order.split(batch_size):
-            indices, values = features_of(rows)
-            slope = batch_gradient(indices, values, labels[rows], factors[rows], weights)
-            rate = config.learning_rate * (1 - step / total_steps if config.decay else 1.0)
-            step += 1
-            weights, state = descend(
-                weights, slope / len(rows), state, step, rate, len(labels), config
-            )
-    return weights
+        first_step = number * (plan.total_steps // config.passes)
+        if kept is not None:
+            state = _fused_pass(kept, labels, factors, order, state, first_step, plan)
+        else:
+            state = _plain_pass(features_of, labels, factors, order, state, first_step, plan)
+    return state[0]
+
+
+class _Plan(NamedTuple):
+    config: FitConfig
+    batch_size: int
+    total_steps: int
+
+
+def _plain_pass(
+    features_of: FeaturesOf | KeptFeatures,
+    labels: Tensor,
+    factors: Tensor,
+    order: Tensor,
+    state: State,
+    step: int,
+    plan: _Plan,
+) -> State:
+    """One pass over all points: the definition."""
+    config = plan.config
+    for rows in order.split(plan.batch_size):
+        indices, values = features_of(rows)
+        slope = batch_gradient(indices, values, labels[rows], factors[rows], state[0])
+        rate = config.learning_rate * (1 - step / plan.total_steps if config.decay else 1.0)
+        step += 1
+        state = descend(state, slope / len(rows), step, rate, len(labels), config)
+    return state
+
+
+def _fused_pass(
+    features: KeptFeatures,
+    labels: Tensor,
+    factors: Tensor,
+    order: Tensor,
+    state: State,
+    step: int,
+    plan: _Plan,
+) -> State:
+    """The same pass in the native kernel."""
+    config = plan.config
+    return torch.ops.lardhm.descent_pass(
+        *features, labels, factors, order, *state, plan.batch_size, step, plan.total_steps,
+        config.learning_rate, config.decay, config.preconditioner, config.l1, config.l2,
+    )  # fmt: skip
 
 
 def batch_gradient(
@@ -142,25 +198,28 @@ def batch_gradient(
 
 
 def descend(
-    weights: Tensor,
-    slope: Tensor,
-    state: tuple[Tensor, Tensor],
-    step: int,
-    rate: float,
-    num_points: int,
-    config: FitConfig,
-) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """One step of eq. (4) on the mean loss; l1 acts as a soft threshold after it."""
+    state: State, slope: Tensor, step: int, rate: float, num_points: int, config: FitConfig
+) -> State:
+    """One step of eq. (4) on the mean loss; l1 acts as a soft threshold after it.
+
+    Args:
+        state: (M,) weights and the running mean and mean square of the slope.
+        slope: (M,) gradient of the batch's mean loss.
+        step: number of this step, from 1.
+        rate: eta_t.
+        num_points: N, over which the regularizer is spread.
+        config: regularizer and preconditioner.
+    """
+    weights, mean, square = state
     slope = slope + 2 * config.l2 / num_points * weights
     if not config.preconditioner:
         moved, reach = weights - rate * slope, torch.full_like(weights, rate)
     else:
-        mean = 0.9 * state[0] + 0.1 * slope
-        square = 0.99 * state[1] + 0.01 * slope.square()
-        state = (mean, square)
+        mean = 0.9 * mean + 0.1 * slope
+        square = 0.99 * square + 0.01 * slope.square()
         reach = rate / ((square / (1 - 0.99**step)).sqrt() + 1e-10)
         moved = weights - reach * mean / (1 - 0.9**step)
     if config.l1:
         threshold = reach * config.l1 / num_points
         moved = moved.sign() * (moved.abs() - threshold).clamp(min=0)
-    return moved, state
+    return moved, mean, square

@@ -209,9 +209,8 @@ class LardHilbertMap(nn.Module):
         index = self._fresh_index()
 
         def features_of(rows: Tensor) -> tuple[Tensor, Tensor]:
-            points = local[rows]
-            indices = native.nearest_centers(points, centers, self.num_neighbors, index)
-            return indices, lard_kernel(points, centers, scale_tril, indices)
+            k = self.num_neighbors
+            return native.nearest_features(local[rows], centers, scale_tril, k, index)
 
         features = keep_features(features_of, len(local), CACHE_BYTES, local.device)
         start = self.weights.detach()

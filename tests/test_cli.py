@@ -88,6 +88,8 @@ def test_flat_scans_make_a_two_dimensional_map_on_request(tmp_path):
     run("fit", tmp_path / "flat.npz", "--dim", 2, "-o", tmp_path / "flat.pt")
     assert LardHilbertMap.load(tmp_path / "flat.pt").dim == 2
     run("evaluate", tmp_path / "flat.pt", tmp_path / "flat.npz")
+    run("query", tmp_path / "flat.pt", tmp_path / "flat.npz", "-o", tmp_path / "p.npy")
+    assert len(np.load(tmp_path / "p.npy")) == 800
     run("fit", tmp_path / "flat.npz", "-o", tmp_path / "solid.pt")
     assert LardHilbertMap.load(tmp_path / "solid.pt").dim == 3
 

@@ -3,8 +3,11 @@ import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
 
+from lardhm_torch import native
+from lardhm_torch.features import nearest_features
 from lardhm_torch.fitting import (
     FitConfig,
+    KeptFeatures,
     balance_classes,
     batch_gradient,
     fit_weights,
@@ -143,3 +146,44 @@ def test_kept_features_are_the_same_and_computed_once():
 def test_settings_are_checked_when_made(settings, message):
     with pytest.raises(ValueError, match=message):
         FitConfig(**settings)
+
+
+@pytest.mark.skipif(not native.available(), reason="the native kernel is not available")
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"l1": 5.0, "balance": False}, {"preconditioner": False, "decay": False, "batch_size": 7}],
+)
+def test_the_fused_passes_equal_the_plain_ones(dtype, settings):
+    indices, values, labels = problem(points=2000)
+    kept = KeptFeatures(indices, values.to(dtype))
+    config, start = FitConfig(**settings), torch.zeros(12, dtype=dtype)
+    fused, plain = (
+        fit_weights(features, labels.to(dtype), start, config, torch.Generator().manual_seed(0))
+        for features in (kept, lambda rows: kept(rows))
+    )
+    # float32 sums of a batch are added in another order
+    tolerance = 1e-3 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(fused, plain, atol=tolerance, rtol=tolerance)
+
+
+@pytest.mark.skipif(not native.available(), reason="the native kernel is not available")
+def test_the_fused_pass_refuses_rows_that_are_not_there():
+    indices, values, labels = problem()
+    kept = KeptFeatures(indices + 5, values)
+    with pytest.raises(RuntimeError, match="index out of range"):
+        fit_weights(kept, labels, torch.zeros(12, dtype=F64), FitConfig(), torch.Generator())
+
+
+@pytest.mark.skipif(not native.available(), reason="the native kernel is not available")
+@pytest.mark.parametrize("dim", [2, 3])
+def test_native_training_features_equal_the_definition(dim):
+    rng = torch.Generator().manual_seed(0)
+    points, centers = (torch.randn(n, dim, generator=rng, dtype=F64) for n in (500, 60))
+    factors = (
+        torch.eye(dim, dtype=F64) + 0.3 * torch.rand(60, dim, dim, generator=rng, dtype=F64).tril()
+    )
+    expected = nearest_features(points, centers, factors, 5)
+    found = native.nearest_features(points, centers, factors, 5, native.build_index(centers, 5))
+    assert torch.equal(found[0], expected[0])
+    torch.testing.assert_close(found[1], expected[1])

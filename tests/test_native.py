@@ -164,6 +164,25 @@ def test_neighbors_are_exact_whatever_the_layout(kind, count, dim, k, dtype, see
     assert_neighbors_exact(points, centers, k, torch.ops.lardhm.nearest(points, centers, k, index))
 
 
+@pytest.mark.parametrize("count", [1, 10, 200, 3000])
+def test_few_points_in_a_large_map_are_answered_exactly(ops, count):
+    parameters = make_map(20_000, 3, torch.float32)
+    points = make_points(count, 3, torch.float32)
+    index = ops.build_index(parameters[0], 5)
+    found = torch.cat([ops.nearest(p, parameters[0], 5, index) for p in points.split(1000)])
+    for some, rows in zip(points.split(200), found.split(200), strict=True):
+        assert_neighbors_exact(some, parameters[0], 5, rows)
+    assert torch.equal(found, ops.nearest(points, parameters[0], 5, index))
+    terms = true_terms(points, parameters, found, torch.float64)
+    answer = ops.occupancy(points, *parameters, 5, index, False).double()
+    assert ((answer - terms.sum(dim=1)).abs() <= 1e-5 * (1 + terms.abs().sum(dim=1))).all()
+    grad = torch.ones(count)
+    by_weights = ops.occupancy_backward(grad, points, *parameters, 5, index, False, 8)[3]
+    expected = torch.zeros(20_000, dtype=torch.float64)
+    expected.index_add_(0, found.flatten(), (terms / parameters[2][found]).flatten())
+    torch.testing.assert_close(by_weights.double(), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_order_and_number_of_points_do_not_change_a_bit(ops):
     parameters = make_map(900, 3, torch.float32)
     points = make_points(50_000, 3, torch.float32)
@@ -589,8 +608,8 @@ def test_a_change_of_source_or_compiler_is_another_library(tmp_path, monkeypatch
     assert first == build._cache_key("c++")
     assert first != build._cache_key("g++")
     changed = tmp_path / "kernel.cpp"
-    changed.write_bytes(build.SOURCE.read_bytes() + b"\n")
-    monkeypatch.setattr(build, "SOURCE", changed)
+    changed.write_bytes(build.SOURCES[0].read_bytes() + b"\n")
+    monkeypatch.setattr(build, "SOURCES", (changed, build.SOURCES[1]))
     assert first != build._cache_key("c++")
 
 

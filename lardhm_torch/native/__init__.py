@@ -114,6 +114,21 @@ def assign(
     return labels, counts.to(dtype), sums.to(dtype), scatters.to(dtype)
 
 
+def nearest_features(
+    points: Tensor, centers: Tensor, scale_tril: Tensor, num_neighbors: int, index: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As `features.nearest_features`, without gradients."""
+    indices = nearest_centers(points, centers, num_neighbors, index)
+    if not supports(points):
+        return indices, features.lard_kernel(points, centers, scale_tril, indices)
+    return indices, torch.ops.lardhm.kernel_values(points, centers, scale_tril, indices)
+
+
+def descends(values: Tensor) -> bool:
+    """Whether `torch.ops.lardhm.descent_pass` can train on these kept features."""
+    return values.device.type == "cpu" and values.dtype in DTYPES and available()
+
+
 def _register() -> None:
     """Shapes for `torch.compile` and `torch.export`, and the gradient."""
     library = torch.library

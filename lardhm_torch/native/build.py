@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 
-SOURCE = Path(__file__).with_name("kernel.cpp")
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("kernel.cpp", "descent.cpp"))
 FLAGS = (
     "-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno",
     "-fno-trapping-math", "-fno-tree-slp-vectorize",  # packs neighbors through memory, and stalls
@@ -105,7 +105,7 @@ def _cache_folders() -> list[Path]:
 
 def _cache_key(compiler: str) -> str:
     parts = [
-        SOURCE.read_bytes(),
+        *(source.read_bytes() for source in SOURCES),
         torch.__version__.encode(),
         " ".join((compiler, *FLAGS)).encode(),
         f"{sys.platform} {platform.machine()}".encode(),
@@ -127,7 +127,7 @@ def _processor_flags() -> bytes:
 def _compile(compiler: str, target: Path) -> None:
     root = Path(torch.__file__).parent
     command = [
-        compiler, *FLAGS, f"-isystem{root / 'include'}", str(SOURCE), "-o", str(target),
+        compiler, *FLAGS, f"-isystem{root / 'include'}", *map(str, SOURCES), "-o", str(target),
         f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu", "-lc10",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)

@@ -594,48 +594,71 @@ struct AlignedArray {
   }
 };
 
-constexpr int64_t kPackGrain = 8192;
+constexpr int64_t kPackGrain = 512;  // blocks packed in one go
 
-// Centers by rank; a center that is not finite is farther than any other.
+// Parameters by rank. Packed all at once, or, for a few points of a large map, a block when it is
+// first a candidate. Without factors and weights, positions alone.
 template <class T, int D>
-void pack_positions(const Index& index, const T* centers, AlignedArray<T>& positions) {
-  const int64_t count = index.header.count;
-  positions.allocate(count * Layout<D>::position);
-  run_tasks((count + kPackGrain - 1) / kPackGrain, [&](int64_t task) {
-    const int64_t end = std::min(count, (task + 1) * kPackGrain);
-    for (int64_t rank = task * kPackGrain; rank < end; ++rank) {
-      const T* center = centers + int64_t(index.order[rank]) * D;
-      T* to = positions.data + rank * Layout<D>::position;
-      bool finite = true;
-      for (int d = 0; d < D; ++d) finite = finite && std::isfinite(center[d]);
-      for (int d = 0; d < Layout<D>::position; ++d)
-        to[d] = d >= D ? T(0) : finite ? center[d] : std::numeric_limits<T>::infinity();
-    }
-  });
-}
+struct Parameters {
+  const Index& index;
+  const T *centers, *scale_tril, *weights;
+  AlignedArray<T> positions, shapes;
+  std::vector<char> packed;  // blocks; empty when all are
 
-template <class T, int D>
-void pack_shapes(const Index& index, const T* scale_tril, const T* weights,
-                 AlignedArray<T>& shapes) {
-  using L = Layout<D>;
-  const int64_t count = index.header.count;
-  shapes.allocate(count * L::shape);
-  run_tasks((count + kPackGrain - 1) / kPackGrain, [&](int64_t task) {
-    const int64_t end = std::min(count, (task + 1) * kPackGrain);
-    for (int64_t rank = task * kPackGrain; rank < end; ++rank) {
-      const int64_t row = index.order[rank];
-      const T* factor = scale_tril + row * D * D;
-      T* to = shapes.data + rank * L::shape;
-      for (int i = 0; i < D; ++i) to[i] = T(1) / factor[i * D + i];
-      to[L::below] = factor[D];
-      if (D == 3) {
-        to[L::below + 1] = factor[2 * D];
-        to[L::below + 2] = factor[2 * D + 1];
-      }
-      to[L::weight] = weights[row];
+  Parameters(const Index& index_, const T* centers_, const T* scale_tril_, const T* weights_,
+             bool all)
+      : index(index_), centers(centers_), scale_tril(scale_tril_), weights(weights_) {
+    positions.allocate(index.header.count * Layout<D>::position);
+    if (scale_tril) shapes.allocate(index.header.count * Layout<D>::shape);
+    if (!all) packed.assign(index.blocks, 0);
+    if (!all) return;
+    run_tasks((index.blocks + kPackGrain - 1) / kPackGrain, [&](int64_t task) {
+      const int64_t end = std::min(index.blocks, (task + 1) * kPackGrain);
+      for (int64_t block = task * kPackGrain; block < end; ++block) pack(block);
+    });
+  }
+
+  void need(const std::vector<int32_t>& ranks, int64_t size) {
+    for (int64_t i = 0; i < size; ++i) {
+      char& done = packed[ranks[i] / kBlock];
+      if (!done) pack(ranks[i] / kBlock);
+      done = 1;
     }
-  });
-}
+  }
+
+  void pack(int64_t block) {
+    const int64_t count = index.header.count, end = std::min(count, (block + 1) * kBlock);
+    for (int64_t rank = block * kBlock; rank < end; ++rank) {
+      const int64_t soon = index.order[std::min(rank + kBlock, count - 1)];
+      __builtin_prefetch(centers + soon * D);
+      pack_position(centers + int64_t(index.order[rank]) * D, rank);
+      if (!scale_tril) continue;
+      __builtin_prefetch(scale_tril + soon * D * D);
+      pack_shape(index.order[rank], rank);
+    }
+  }
+
+  // A center that is not finite is farther than any other.
+  void pack_position(const T* center, int64_t rank) {
+    T* to = positions.data + rank * Layout<D>::position;
+    const bool finite = is_finite(center, D);
+    for (int d = 0; d < Layout<D>::position; ++d)
+      to[d] = d >= D ? T(0) : finite ? center[d] : std::numeric_limits<T>::infinity();
+  }
+
+  void pack_shape(int64_t row, int64_t rank) {
+    using L = Layout<D>;
+    const T* factor = scale_tril + row * D * D;
+    T* to = shapes.data + rank * L::shape;
+    for (int i = 0; i < D; ++i) to[i] = T(1) / factor[i * D + i];
+    to[L::below] = factor[D];
+    if (D == 3) {
+      to[L::below + 1] = factor[2 * D];
+      to[L::below + 2] = factor[2 * D + 1];
+    }
+    to[L::weight] = weights[row];
+  }
+};
 
 // ---------------------------------------------------------------------------------------------
 // Candidates: centers that can be among the k nearest of some point of a box.
@@ -888,6 +911,26 @@ KthFn<T, D> kth_distance_for(int k) {
 #undef LARDHM_USE
 }
 
+constexpr int64_t kMostPoints = 2048;  // in a region
+constexpr double kRegionPoints = 6000, kGroupPoints = 128, kSparse = 25;
+
+// How many sorted points share a list of blocks, a list of candidates, a register. The fewer points
+// there are a center, the more centers lie between neighbors: where they are very sparse, a point
+// by itself has the shortest list.
+struct Sharing {
+  int64_t region, group, packet;
+
+  Sharing(int64_t points, int64_t centers, int64_t lanes) {
+    const double sparsity = std::max(1.0, double(centers) / double(std::max<int64_t>(points, 1)));
+    region = std::max<int64_t>(1, std::min(kMostPoints, int64_t(kRegionPoints / sparsity)));
+    group = std::max<int64_t>(lanes, int64_t(kGroupPoints / sparsity));
+    packet = lanes;
+    if (sparsity > kSparse) group = packet = 1;
+  }
+};
+
+constexpr double kPointsPerCell = 4;     // of the Z curve
+
 // What one thread needs while it works through points.
 template <class T, int D>
 struct Scratch {
@@ -898,6 +941,7 @@ struct Scratch {
   Candidates<D> near;
   std::vector<int32_t> list;
   std::vector<uint32_t> bits;  // lanes that select each of the list
+  Sharing sharing{0, 0, 1};
   Region<D> region, group;
   float far_radius = 0, near_radius = 0, radius = 0;  // [m] how far the lists and a packet look
   AlignedArray<typename Simd<T>::I> distance;
@@ -915,10 +959,6 @@ struct Scratch {
   }
 };
 
-constexpr int64_t kRegionPoints = 2048;  // sorted points that share a list of candidates
-constexpr int64_t kGroupPoints = 128;    // and a shorter one
-constexpr double kPointsPerCell = 4;     // of the Z curve
-
 template <class T, int D>
 struct Engine {
   using V = typename Simd<T>::V;
@@ -927,14 +967,16 @@ struct Engine {
 
   Index index;
   const T* points;
+  Parameters<T, D>& parameters;
   const T* positions;
   int k;
   KthFn<T, D> kth;
   T origin[D];
   float reach, smallest_radius;  // [m] edge of the centers' box; where guesses begin
 
-  Engine(const Index& index_, const T* points_, const T* positions_, int64_t k_)
-      : index(index_), points(points_), positions(positions_), k(int(k_)),
+  Engine(const T* points_, Parameters<T, D>& parameters_, int64_t k_)
+      : index(parameters_.index), points(points_), parameters(parameters_),
+        positions(parameters_.positions.data), k(int(k_)),
         kth(kth_distance_for<T, D>(int(k_))), reach(0) {
     for (int d = 0; d < D; ++d) {
       origin[d] = T(index.header.low[d]);
@@ -971,7 +1013,7 @@ struct Engine {
     return kept;
   }
 
-  // Sorted points first .. stop axis by axis, the last one again up to a full register.
+  // Sorted points first .. stop axis by axis.
   void gather(int64_t begin, int64_t first, int64_t stop, Scratch<T, D>& s) const {
     constexpr int64_t kAhead = 24;
     const int64_t n = stop - first, last = int64_t(s.sorter.items.size()) - 1;
@@ -983,8 +1025,6 @@ struct Engine {
       const T* point = points + (begin + s.order[i]) * D;
       for (int d = 0; d < D; ++d) s.x[d][i] = point[d];
     }
-    for (int d = 0; d < D; ++d)
-      for (int i = 0; i < W; ++i) s.x[d][n + i] = s.x[d][n - 1];
   }
 
   // Where the run of sorted points i .. stop should end: not across a border of the Z curve's cells
@@ -1004,12 +1044,22 @@ struct Engine {
     return stop;
   }
 
+  // One register of coordinates; lanes from `end` on hold the last point before it.
+  static V coordinates(const std::vector<T>& x, int64_t i, int64_t end) {
+    const V all = load<V>(x.data() + i);
+    if (i + W <= end) return all;
+    I lane;
+    for (int j = 0; j < W; ++j) lane[j] = j;
+    const typename Simd<T>::Int count = end - i;
+    return lane < count ? all : x[end - 1] - V{};
+  }
+
   static Box<T, D> box_of_sorted(const Scratch<T, D>& s, int64_t begin, int64_t end) {
     Box<T, D> box;
     for (int d = 0; d < D; ++d) {
-      V low = load<V>(s.x[d].data() + begin), high = low;
+      V low = coordinates(s.x[d], begin, end), high = low;
       for (int64_t i = begin + W; i < end; i += W) {
-        const V x = load<V>(s.x[d].data() + i);
+        const V x = coordinates(s.x[d], i, end);
         low = x < low ? x : low;
         high = x > high ? x : high;
       }
@@ -1063,15 +1113,16 @@ struct Engine {
   template <class Visitor>
   void visit(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor& visitor) const {
     const int64_t n = sort_points(begin, end, s, visitor);
-    s.order.resize(kRegionPoints);
-    for (int d = 0; d < D; ++d) s.x[d].resize(kRegionPoints + W);
+    s.order.resize(kMostPoints);
+    for (int d = 0; d < D; ++d) s.x[d].resize(kMostPoints + W);
+    s.sharing = Sharing(n, index.header.count, W);
     for (int64_t i = 0, stop; i < n; i = stop) {
-      stop = cut(s.sorter.items, n, i, std::min(n, i + kRegionPoints));
+      stop = cut(s.sorter.items, n, i, std::min(n, i + s.sharing.region));
       gather(begin, i, stop, s);
       s.region = region_of(s, 0, stop - i);
       s.far_radius = -1;
       for (int64_t j = i, end; j < stop; j = end) {
-        end = cut(s.sorter.items, n, j, std::min(stop, j + kGroupPoints));
+        end = cut(s.sorter.items, n, j, std::min(stop, j + s.sharing.group));
         s.group = region_of(s, j - i, end - i);
         s.near_radius = -1;
         visit_group(begin, n, i, j, end, s, visitor);
@@ -1089,12 +1140,12 @@ struct Engine {
                    Scratch<T, D>& s, Visitor& visitor) const {
     Packet<T, D> packet;
     for (int64_t end; i < stop; i = end) {
-      end = cut(s.sorter.items, n, i, std::min<int64_t>(stop, i + W));
+      end = cut(s.sorter.items, n, i, std::min(stop, i + s.sharing.packet));
       packet.begin = begin;
       packet.order = s.order.data() + (i - first);
       packet.lanes = int(end - i);
-      for (int d = 0; d < D; ++d) packet.x[d] = load<V>(s.x[d].data() + (i - first));
-      search(packet, region_of(s, i - first, i - first + 1), s);
+      for (int d = 0; d < D; ++d) packet.x[d] = coordinates(s.x[d], i - first, end - first);
+      search(packet, region_of(s, i - first, end - first), s);
       visitor.packet(packet, s.selected);
     }
   }
@@ -1128,6 +1179,7 @@ struct Engine {
     }
     s.near_radius = radius;
     s.near.collect(index, s.far, s.group, radius);
+    if (!parameters.packed.empty()) parameters.need(s.near.rank, s.near.size);
     s.reserve_list(s.near.size);
   }
 };
@@ -1319,6 +1371,7 @@ struct AssignVisitor {
 // Running a visitor over all points.
 
 constexpr int64_t kSmallBlock = 32768;
+constexpr int64_t kPointsOfFew = 64;  // fewer than clusters / 64: parameters packed as needed
 constexpr int64_t kLargeBlock = int64_t(1) << 20;
 
 // An index for the call: the one given where it fits, else one of its own.
@@ -1369,10 +1422,11 @@ int64_t block_size(const Engine<T, D>& engine, int64_t n, int64_t workers) {
 template <class T, int D, class Visitor>
 void visit_all(const Engine<T, D>& engine, int64_t n, const Visitor& visitor) {
   if (n == 0) return;
-  const int64_t block = block_size(engine, n, num_threads());
+  const int64_t threads = engine.parameters.packed.empty() ? num_threads() : 1;
+  const int64_t block = block_size(engine, n, threads);
   const int64_t blocks = (n + block - 1) / block;
   std::atomic<int64_t> next{0};
-  run_tasks(std::min(blocks, num_threads()), [&](int64_t) {
+  run_tasks(std::min(blocks, threads), [&](int64_t) {
     Scratch<T, D> scratch;
     Visitor own = visitor;
     for (int64_t i = next++; i < blocks; i = next++)
@@ -1442,14 +1496,15 @@ auto dispatch(const Tensor& centers, const Use& use) {
 
 void check_k(int64_t k) { STD_TORCH_CHECK(k >= 1, "k must be at least 1; got ", k); }
 
-// Runs `work(engine, positions)` with an index that fits the centers.
+// Runs `work(engine)` with an index that fits the centers; factors and weights may be null.
 template <class T, int D, class Work>
-void with_engine(const Tensor& points, const Tensor& centers, int64_t k, const Tensor& given,
-                 const Work& work) {
+void with_engine(const Tensor& points, const Tensor& centers, const Tensor* scale_tril,
+                 const Tensor* weights, int64_t k, const Tensor& given, const Work& work) {
   const CallIndex<T, D> call(given, in<T>(centers), centers.size(0));
-  AlignedArray<T> positions;
-  pack_positions<T, D>(call.index, in<T>(centers), positions);
-  work(Engine<T, D>(call.index, in<T>(points), positions.data, k), positions.data);
+  const bool all = points.size(0) >= centers.size(0) / kPointsOfFew;
+  Parameters<T, D> parameters(call.index, in<T>(centers), scale_tril ? in<T>(*scale_tril) : nullptr,
+                              weights ? in<T>(*weights) : nullptr, all);
+  work(Engine<T, D>(in<T>(points), parameters, k));
 }
 
 Tensor build_index(const Tensor& given_centers, int64_t k) {
@@ -1491,7 +1546,7 @@ Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t 
   if (k == 0) return rows;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
-    with_engine<T, dim()>(points, centers, k, index, [&](const auto& engine, const T*) {
+    with_engine<T, dim()>(points, centers, nullptr, nullptr, k, index, [&](const auto& engine) {
       visit_all(engine, points.size(0),
                 NearestVisitor<T, dim()>{engine.index.order, k, out<int64_t>(rows)});
     });
@@ -1540,12 +1595,12 @@ Tensor occupancy(const Tensor& given_points, const Tensor& given_centers,
       occupancy_of_nothing<T>(points, probability, out<T>(values));
       return 0;
     }
-    with_engine<T, dim()>(points, centers, k, index, [&](const auto& engine, const T* positions) {
-      AlignedArray<T> shapes;
-      pack_shapes<T, dim()>(engine.index, in<T>(scale_tril), in<T>(weights), shapes);
-      visit_all(engine, points.size(0),
-                OccupancyVisitor<T, dim()>{positions, shapes.data, probability, out<T>(values)});
-    });
+    with_engine<T, dim()>(
+        points, centers, &scale_tril, &weights, k, index, [&](const auto& engine) {
+          const OccupancyVisitor<T, dim()> visitor{engine.positions, engine.parameters.shapes.data,
+                                                   probability, out<T>(values)};
+          visit_all(engine, points.size(0), visitor);
+        });
     return 0;
   });
   return values;
@@ -1604,16 +1659,16 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     using L = Layout<dim()>;
-    with_engine<T, dim()>(points, centers, k, index, [&](const auto& engine, const T* positions) {
-      AlignedArray<T> shapes;
-      pack_shapes<T, dim()>(engine.index, in<T>(scale_tril), in<T>(weights), shapes);
+    const auto work = [&](const auto& engine) {
       const int64_t size = count * L::gradient;
-      const int64_t parts = parts_of(n, size * sizeof(T));
+      const int64_t parts =
+          engine.parameters.packed.empty() ? parts_of(n, size * sizeof(T)) : 1;
       std::vector<T> sums((wanted & ~kPoints) ? size * parts : 0);
       visit_parts(engine, n, parts, [&](int64_t part) {
-        return BackwardVisitor<T, dim()>{positions, shapes.data, in<T>(grad), probability, wanted,
-                                         (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr,
-                                         sums.data() + part * size, {}};
+        return BackwardVisitor<T, dim()>{
+            engine.positions, engine.parameters.shapes.data, in<T>(grad), probability, wanted,
+            (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr, sums.data() + part * size,
+            {}};
       });
       if (wanted & ~kPoints)
         scatter_gradients<T, dim()>(
@@ -1621,7 +1676,8 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
             (wanted & kWeights) ? out<T>(std::get<3>(result)) : nullptr,
             (wanted & kCenters) ? out<T>(std::get<1>(result)) : nullptr,
             (wanted & kScaleTril) ? out<T>(std::get<2>(result)) : nullptr);
-    });
+    };
+    with_engine<T, dim()>(points, centers, &scale_tril, &weights, k, index, work);
     return 0;
   });
   return result;
@@ -1656,17 +1712,20 @@ Gradients assign(const Tensor& given_points, const Tensor& given_centers,
   const Gradients result{torch::stable::new_empty(points, {n}, ScalarType::Long),
                          torch::stable::new_zeros(points, {count}),
                          torch::stable::new_zeros(points, {count, dim_size}),
-                         torch::stable::new_zeros(points, {scatter ? count : 0, dim_size, dim_size})};
+                         torch::stable::new_zeros(
+                             points, {scatter ? count : 0, dim_size, dim_size})};
   if (n == 0) return result;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
-    with_engine<T, dim()>(points, centers, 1, index, [&](const auto& engine, const T* positions) {
+    with_engine<T, dim()>(points, centers, nullptr, nullptr, 1, index, [&](const auto& engine) {
       const int64_t size = count * AssignVisitor<T, dim()>::kMoments;
-      const int64_t parts = parts_of(n, size * sizeof(double));
+      const int64_t parts =
+          engine.parameters.packed.empty() ? parts_of(n, size * sizeof(double)) : 1;
       std::vector<double> sums(size * parts);
       visit_parts(engine, n, parts, [&](int64_t part) {
-        return AssignVisitor<T, dim()>{engine.index.order, positions, scatter,
-                                       out<int64_t>(std::get<0>(result)), sums.data() + part * size};
+        return AssignVisitor<T, dim()>{engine.index.order, engine.positions, scatter,
+                                       out<int64_t>(std::get<0>(result)),
+                                       sums.data() + part * size};
       });
       scatter_moments<T, dim()>(engine.index.order, sums, parts, count, out<T>(std::get<1>(result)),
                                 out<T>(std::get<2>(result)),
