@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lardhm_torch import native
 from lardhm_torch.native import nearest_centers
 
 POINTS_PER_CLUSTER = 20  # of the rule that chooses the number of clusters
@@ -55,8 +56,8 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     """
     num_clusters = max(1, min(num_clusters, len(points) // MIN_COUNT))
     centers = mini_batch_kmeans(points, num_clusters, rng)
-    labels = nearest_centers(points, centers, 1).squeeze(1)
-    return merge_small(cluster_moments(points, labels, num_clusters))
+    _, counts, sums, scatters = native.assign(points, centers)
+    return merge_small(clusters_about(centers, counts, sums, scatters))
 
 
 def cluster_classes(
@@ -144,11 +145,15 @@ def mini_batch_kmeans(
     """
     batch_size = min(len(points), batch_size or 10 * num_clusters)
     centers = _stratified_start(points, num_clusters, rng)
+    shape = (iterations, batch_size)
+    rows = torch.randint(len(points), shape, generator=rng, device=rng.device)
+    if native.supports(points):
+        return torch.ops.lardhm.kmeans(points, centers, rows, batch_size, restart_every)
     met = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
     for iteration in range(iterations):
         if iteration % restart_every == 0:
             met.zero_()
-        batch = points[torch.randint(len(points), (batch_size,), generator=rng, device=rng.device)]
+        batch = points[rows[iteration]]
         labels = nearest_centers(batch, centers, 1).squeeze(1)
         pulls = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
         met += torch.bincount(labels, minlength=num_clusters)
@@ -166,7 +171,7 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     count = START_POINTS * num_clusters
     if len(points) > count:
         points = points[torch.randint(len(points), (count,), generator=rng, device=rng.device)]
-    ordered = points[z_order(points).argsort(stable=True)]
+    ordered = points[z_order(points)]
     if num_clusters >= len(points):
         return ordered
     lag = max(1, len(points) // (4 * num_clusters))
@@ -181,7 +186,9 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
 
 
 def z_order(points: Tensor) -> Tensor:
-    """(N, D) positions -> (N,) place along a space-filling curve (Morton code), int64."""
+    """(N, D) positions -> (N,) rows in the order of a space-filling curve (Morton code), int64."""
+    if native.supports(points):
+        return torch.ops.lardhm.z_order(points)
     bits = min(10, 62 // points.shape[1])
     lower, upper = points.amin(dim=0), points.amax(dim=0)
     edge = (upper - lower).max().clamp(min=torch.finfo(points.dtype).tiny)
@@ -190,7 +197,21 @@ def z_order(points: Tensor) -> Tensor:
     for bit in range(bits):
         for axis in range(points.shape[1]):
             code |= ((cells[:, axis] >> bit) & 1) << (bit * points.shape[1] + axis)
-    return code
+    return code.argsort(stable=True)
+
+
+def clusters_about(centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor) -> Clusters:
+    """Clusters of the points that `native.assign` gave to each center.
+
+    Args:
+        centers: (M, D) what the moments are taken about [m].
+        counts: (M,) number of points.
+        sums: (M, D) sum of the offsets from the center [m].
+        scatters: (M, D, D) sum of their outer products [m^2].
+    """
+    shift = sums / counts.clamp(min=1)[:, None]
+    about_mean = scatters - sums[:, :, None] * shift[:, None, :]
+    return Clusters(counts.long(), centers + shift, about_mean)
 
 
 def cluster_moments(points: Tensor, labels: Tensor, num_clusters: int) -> Clusters:

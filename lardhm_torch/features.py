@@ -6,6 +6,7 @@ Everything here is plain torch, on any device, dtype and dimension; `native` ans
 from __future__ import annotations
 
 import importlib.util
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +15,36 @@ CHUNK_ENTRIES = 1 << 23  # distances held at a time by the exhaustive search
 KDTREE_MIN_CENTERS = 64  # below this the exhaustive search is as fast
 QUERY_CHUNK = 1 << 17  # points whose features are held at a time by a query
 SPARE_CANDIDATES = 4  # neighbors asked beyond k, so that ties can be settled
+
+
+class Kernel(NamedTuple):
+    """What makes features of clusters, beside their tensors: the settings of a map.
+
+    Args:
+        num_neighbors: k nearest clusters that answer for a point.
+        covariance_scale: factor on the clusters' covariances.
+        min_lengthscale: no kernel axis is thinner [m], before ``covariance_scale``.
+    """
+
+    num_neighbors: int
+    covariance_scale: float = 1.0
+    min_lengthscale: float = 0.0
+
+
+def kernel_factors(raw_scale_tril: Tensor, kernel: Kernel) -> Tensor:
+    """(M, D, D) factors with the logarithm of their diagonals -> (M, D, D) kernel factors [m].
+
+    Any raw value gives a valid lower Cholesky factor, so that any optimizer may move it.
+    """
+    diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
+    diagonal = torch.diag_embed(diagonal.clamp(min=kernel.min_lengthscale))
+    return kernel.covariance_scale**0.5 * (raw_scale_tril.tril(-1) + diagonal)
+
+
+def raw_factors(scale_tril: Tensor) -> Tensor:
+    """(M, D, D) lower factors -> the same with the logarithm of their diagonals."""
+    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
+    return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
 
 
 def squared_distances(points: Tensor, centers: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from lardhm_torch import native
 
-FEATURE_CHUNK = 1 << 17  # points whose features are computed at a time
+CHUNK_ROWS = 1 << 20  # points whose features are computed at a time
+CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
 State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the slope
 FeaturesOf = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -26,7 +27,7 @@ class FitConfig:
     batch_size=1)``; it leaves log-loss on the table (docs and benchmarks show how much).
     """
 
-    passes: int = 4  # over all points, each in a new random order
+    passes: int = 4  # over all points, in one random order
     batch_size: int | None = None  # points a step; None: N / 128, at least 256
     learning_rate: float = 0.5  # eta of eq. (4)
     decay: bool = True  # eta falls linearly to 0; otherwise constant
@@ -44,39 +45,6 @@ class FitConfig:
             raise ValueError(f"learning_rate must be > 0; got {self.learning_rate}")
         if self.l1 < 0 or self.l2 < 0:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
-
-
-class KeptFeatures(NamedTuple):
-    """Features of all points: (N, K) indices and kernel values; called with rows, those of them."""
-
-    indices: Tensor
-    values: Tensor
-
-    def __call__(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows (B,) -> indices (B, K) and kernel values (B, K)."""
-        return self.indices[rows], self.values[rows]
-
-
-def keep_features(
-    features_of: FeaturesOf, num_points: int, num_bytes: int, device: torch.device
-) -> FeaturesOf | KeptFeatures:
-    """The same features, computed once and kept if that takes at most ``num_bytes``.
-
-    Args:
-        features_of: rows (B,) -> indices (B, K) and kernel values (B, K).
-        num_points: N, rows are 0 to N - 1.
-        num_bytes: what may be kept; above it every batch is computed anew in every pass.
-        device: where rows live.
-    """
-    indices, values = features_of(torch.zeros(1, dtype=torch.long, device=device))
-    row_bytes = indices.shape[1] * (indices.element_size() + values.element_size())
-    if num_points * row_bytes > num_bytes:
-        return features_of
-    chunks = torch.arange(num_points, device=device).split(FEATURE_CHUNK)
-    parts = [features_of(chunk) for chunk in chunks]
-    return KeptFeatures(
-        torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
-    )
 
 
 def balance_classes(labels: Tensor) -> Tensor:
@@ -101,7 +69,7 @@ def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
 
 
 def fit_weights(
-    features_of: FeaturesOf | KeptFeatures,
+    features_of: FeaturesOf,
     labels: Tensor,
     weights: Tensor,
     config: FitConfig,
@@ -112,7 +80,9 @@ def fit_weights(
 
     w <- w - eta_t A^-1 g, with g the gradient of a batch scaled to all points. The preconditioner
     A is the running root mean square of g, and g is smoothed over steps (Adam), so that weights of
-    rarely seen clusters learn as fast as others.
+    rarely seen clusters learn as fast as others. Points are shuffled once; every pass takes them in
+    that order. Features are computed once and kept up to `CACHE_BYTES`, the others anew in every
+    pass.
 
     Args:
         features_of: rows (B,) -> indices (B, K) and kernel values (B, K) of those points.
@@ -129,60 +99,81 @@ def fit_weights(
     """
     factors = balance_classes(labels) if config.balance else torch.ones_like(labels)
     batch_size = config.batch_size or max(256, len(labels) // 128)
-    plan = _Plan(config, batch_size, config.passes * -(-len(labels) // batch_size))
-    kept = features_of if isinstance(features_of, KeptFeatures) else None
-    if kept is not None and not native.descends(kept.values):
-        kept = None
+    plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
+    order = torch.randperm(len(labels), generator=rng, device=rng.device)
+    chunks = _Chunks(features_of, labels, factors, order, batch_size)
     state = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights))
-    for number in tqdm(range(config.passes), "weights", disable=None if progress else True):
-        order = torch.randperm(len(labels), generator=rng, device=rng.device)
-        first_step = number * (plan.total_steps // config.passes)
-        if kept is not None:
-            state = _fused_pass(kept, labels, factors, order, state, first_step, plan)
-        else:
-            state = _plain_pass(features_of, labels, factors, order, state, first_step, plan)
+    step = 0
+    for _ in tqdm(range(config.passes), "weights", disable=None if progress else True):
+        for chunk in chunks:
+            native_path = native.descends(chunk.indices, chunk.values)
+            state = (_native_steps if native_path else _plain_steps)(chunk, state, step, plan)
+            step += -(-len(chunk.labels) // batch_size)
     return state[0]
 
 
 class _Plan(NamedTuple):
     config: FitConfig
     batch_size: int
+    num_points: int
     total_steps: int
 
 
-def _plain_pass(
-    features_of: FeaturesOf | KeptFeatures,
-    labels: Tensor,
-    factors: Tensor,
-    order: Tensor,
-    state: State,
-    step: int,
-    plan: _Plan,
-) -> State:
-    """One pass over all points: the definition."""
+class _Chunk(NamedTuple):
+    """Some whole batches: (R, K) features, (R,) labels and loss factors."""
+
+    indices: Tensor
+    values: Tensor
+    labels: Tensor
+    factors: Tensor
+
+
+class _Chunks:
+    """The shuffled points, chunk by chunk, as often as asked."""
+
+    def __init__(
+        self,
+        features_of: FeaturesOf,
+        labels: Tensor,
+        factors: Tensor,
+        order: Tensor,
+        batch_size: int,
+    ) -> None:
+        self.features_of, self.labels, self.factors = features_of, labels, factors
+        self.rows = order.split(batch_size * max(1, CHUNK_ROWS // batch_size))
+        self.kept: dict[int, _Chunk] = {}
+        self.room = CACHE_BYTES
+
+    def __iter__(self) -> Iterator[_Chunk]:
+        """Every chunk once, in order."""
+        for number, rows in enumerate(self.rows):
+            yield self.kept[number] if number in self.kept else self._make(number, rows)
+
+    def _make(self, number: int, rows: Tensor) -> _Chunk:
+        chunk = _Chunk(*self.features_of(rows), self.labels[rows], self.factors[rows])
+        size = sum(tensor.numel() * tensor.element_size() for tensor in chunk)
+        if size <= self.room:
+            self.kept[number] = chunk
+            self.room -= size
+        return chunk
+
+
+def _plain_steps(chunk: _Chunk, state: State, step: int, plan: _Plan) -> State:
+    """A step for every batch of the chunk: the definition."""
     config = plan.config
-    for rows in order.split(plan.batch_size):
-        indices, values = features_of(rows)
-        slope = batch_gradient(indices, values, labels[rows], factors[rows], state[0])
-        rate = config.learning_rate * (1 - step / plan.total_steps if config.decay else 1.0)
-        step += 1
-        state = descend(state, slope / len(rows), step, rate, len(labels), config)
+    batches = zip(*(tensor.split(plan.batch_size) for tensor in chunk), strict=True)
+    for step_now, (indices, values, labels, factors) in enumerate(batches, start=step):
+        slope = batch_gradient(indices, values, labels, factors, state[0]) / len(labels)
+        rate = config.learning_rate * (1 - step_now / plan.total_steps if config.decay else 1.0)
+        state = descend(state, slope, step_now + 1, rate, plan.num_points, config)
     return state
 
 
-def _fused_pass(
-    features: KeptFeatures,
-    labels: Tensor,
-    factors: Tensor,
-    order: Tensor,
-    state: State,
-    step: int,
-    plan: _Plan,
-) -> State:
-    """The same pass in the native kernel."""
+def _native_steps(chunk: _Chunk, state: State, step: int, plan: _Plan) -> State:
+    """The same in the native library."""
     config = plan.config
-    return torch.ops.lardhm.descent_pass(
-        *features, labels, factors, order, *state, plan.batch_size, step, plan.total_steps,
+    return torch.ops.lardhm.descent(
+        *chunk, *state, plan.num_points, plan.batch_size, step, plan.total_steps,
         config.learning_rate, config.decay, config.preconditioner, config.l1, config.l2,
     )  # fmt: skip
 

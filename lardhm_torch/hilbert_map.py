@@ -10,10 +10,8 @@ from torch import Tensor, nn
 
 from lardhm_torch import checkpoint, native
 from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances
-from lardhm_torch.features import feature_matrix, lard_kernel
-from lardhm_torch.fitting import FitConfig, fit_weights, keep_features
-
-CACHE_BYTES = 1 << 28  # features of the training points are kept for all passes up to this size
+from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
+from lardhm_torch.fitting import FitConfig, fit_weights
 
 
 class LardHilbertMap(nn.Module):
@@ -91,13 +89,12 @@ class LardHilbertMap(nn.Module):
     @property
     def scale_tril(self) -> Tensor:
         """(M, D, D) lower Cholesky factors of the kernels [m]: covariance scale and floor included."""
-        return self.kernel_factors(self.raw_scale_tril)
+        return kernel_factors(self.raw_scale_tril, self.kernel)
 
-    def kernel_factors(self, raw_scale_tril: Tensor) -> Tensor:
-        """(M, D, D) raw factors -> kernel factors [m], with this map's scale and floor."""
-        diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
-        diagonal = torch.diag_embed(diagonal.clamp(min=self.min_lengthscale))
-        return self.covariance_scale**0.5 * (raw_scale_tril.tril(-1) + diagonal)
+    @property
+    def kernel(self) -> Kernel:
+        """Number of neighbors, covariance scale and floor of the kernels."""
+        return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
 
     def extra_repr(self) -> str:
         """What `print(model)` shows."""
@@ -129,7 +126,7 @@ class LardHilbertMap(nn.Module):
 
     def _query(self, points: Tensor, probability: bool) -> Tensor:
         local = self._to_map_frame(points)
-        state = (self.centers, self.scale_tril, self.weights, self.num_neighbors)
+        state = (self.centers, self.raw_scale_tril, self.weights, self.kernel)
         flat = local.reshape(-1, self.dim)
         answer = native.occupancy(flat, *state, probability=probability, index=self._fresh_index())
         return answer.reshape(local.shape[:-1])
@@ -205,16 +202,14 @@ class LardHilbertMap(nn.Module):
     def _train_weights(
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
     ) -> None:
-        centers, scale_tril = self.centers.detach(), self.scale_tril.detach()
+        centers, raw_scale_tril = self.centers.detach(), self.raw_scale_tril.detach()
         index = self._fresh_index()
 
         def features_of(rows: Tensor) -> tuple[Tensor, Tensor]:
-            k = self.num_neighbors
-            return native.nearest_features(local[rows], centers, scale_tril, k, index)
+            return native.nearest_features(local[rows], centers, raw_scale_tril, self.kernel, index)
 
-        features = keep_features(features_of, len(local), CACHE_BYTES, local.device)
         start = self.weights.detach()
-        weights = fit_weights(features, labels, start, config, rng, progress)
+        weights = fit_weights(features_of, labels, start, config, rng, progress)
         with torch.no_grad():
             self.weights.copy_(weights)
 
@@ -296,8 +291,8 @@ def check_samples(
         )
     if len(points) == 0:
         raise ValueError("points must hold at least one point; got 0")
-    bad = ~points.isfinite().all(dim=1)
-    if bool(bad.any()):
+    if not bool(points.isfinite().all()):
+        bad = ~points.isfinite().all(dim=1)
         raise ValueError(
             f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
             f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
@@ -308,12 +303,6 @@ def check_samples(
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
         raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
     return points, labels
-
-
-def raw_factors(scale_tril: Tensor) -> Tensor:
-    """(M, D, D) lower factors -> the same with the logarithm of their diagonals."""
-    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
-    return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
 
 
 def _resize(model: LardHilbertMap, num_clusters: int) -> None:

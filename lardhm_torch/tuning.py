@@ -159,9 +159,7 @@ class _Tunable:
     def log_odds(self, local: Tensor) -> Tensor:
         """(N, D) positions in the map frame -> (N,) logits under the current parameters."""
         weights, centers, raw = self.current()
-        scale_tril = self.model.kernel_factors(raw)
-        k = self.model.num_neighbors
-        return native.occupancy(local, centers, scale_tril, weights, k, probability=False)
+        return native.occupancy(local, centers, raw, weights, self.model.kernel, probability=False)
 
     def epochs(
         self, local: Tensor, labels: Tensor, config: TuneConfig, rng: torch.Generator

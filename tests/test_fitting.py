@@ -3,15 +3,13 @@ import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
 
-from lardhm_torch import native
-from lardhm_torch.features import nearest_features
+from lardhm_torch import fitting, native
+from lardhm_torch.features import Kernel, kernel_factors, nearest_features
 from lardhm_torch.fitting import (
     FitConfig,
-    KeptFeatures,
     balance_classes,
     batch_gradient,
     fit_weights,
-    keep_features,
     logistic_loss,
 )
 
@@ -118,20 +116,27 @@ def test_the_start_is_left_alone_and_the_seed_decides():
     assert not torch.equal(runs[0], runs[2])
 
 
-def test_kept_features_are_the_same_and_computed_once():
-    indices, values, _ = problem()
+def test_features_are_computed_once_where_they_can_be_kept_and_anew_where_not(monkeypatch):
+    indices, values, labels = problem()
     calls = []
 
     def features_of(rows):
         calls.append(len(rows))
         return indices[rows], values[rows]
 
-    kept = keep_features(features_of, 600, 1 << 20, indices.device)
-    rows = torch.randint(600, (50,))
-    before = len(calls)
-    assert torch.equal(kept(rows)[1], values[rows])
-    assert len(calls) == before
-    assert keep_features(features_of, 600, 100, indices.device) is features_of
+    def fit_in_chunks():
+        calls.clear()
+        start, rng = torch.zeros(12, dtype=F64), torch.Generator().manual_seed(0)
+        return fit_weights(features_of, labels, start, FitConfig(batch_size=50), rng)
+
+    whole = fit_in_chunks()
+    assert calls == [600]
+    monkeypatch.setattr(fitting, "CHUNK_ROWS", 120)  # two whole batches
+    torch.testing.assert_close(fit_in_chunks(), whole)
+    assert calls == [100] * 6
+    monkeypatch.setattr(fitting, "CACHE_BYTES", 3 * 100 * (3 * 8 + 3 * 8 + 8 + 8))
+    torch.testing.assert_close(fit_in_chunks(), whole)
+    assert calls == [100] * (3 + 3 * 4)
 
 
 @pytest.mark.parametrize(
@@ -156,12 +161,15 @@ def test_settings_are_checked_when_made(settings, message):
 )
 def test_the_fused_passes_equal_the_plain_ones(dtype, settings):
     indices, values, labels = problem(points=2000)
-    kept = KeptFeatures(indices, values.to(dtype))
+    values, labels = values.to(dtype), labels.to(dtype)
     config, start = FitConfig(**settings), torch.zeros(12, dtype=dtype)
     fused, plain = (
-        fit_weights(features, labels.to(dtype), start, config, torch.Generator().manual_seed(0))
-        for features in (kept, lambda rows: kept(rows))
-    )
+        fit_weights(
+            lambda rows, given=given: (given[rows], values[rows]),
+            labels, start, config, torch.Generator().manual_seed(0),
+        )
+        for given in (indices.int(), indices)
+    )  # fmt: skip
     # float32 sums of a batch are added in another order
     tolerance = 1e-3 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(fused, plain, atol=tolerance, rtol=tolerance)
@@ -170,9 +178,11 @@ def test_the_fused_passes_equal_the_plain_ones(dtype, settings):
 @pytest.mark.skipif(not native.available(), reason="the native kernel is not available")
 def test_the_fused_pass_refuses_rows_that_are_not_there():
     indices, values, labels = problem()
-    kept = KeptFeatures(indices + 5, values)
+    start, wrong = torch.zeros(12, dtype=F64), indices.int() + 5
     with pytest.raises(RuntimeError, match="index out of range"):
-        fit_weights(kept, labels, torch.zeros(12, dtype=F64), FitConfig(), torch.Generator())
+        fit_weights(
+            lambda rows: (wrong[rows], values[rows]), labels, start, FitConfig(), torch.Generator()
+        )
 
 
 @pytest.mark.skipif(not native.available(), reason="the native kernel is not available")
@@ -180,10 +190,9 @@ def test_the_fused_pass_refuses_rows_that_are_not_there():
 def test_native_training_features_equal_the_definition(dim):
     rng = torch.Generator().manual_seed(0)
     points, centers = (torch.randn(n, dim, generator=rng, dtype=F64) for n in (500, 60))
-    factors = (
-        torch.eye(dim, dtype=F64) + 0.3 * torch.rand(60, dim, dim, generator=rng, dtype=F64).tril()
-    )
-    expected = nearest_features(points, centers, factors, 5)
-    found = native.nearest_features(points, centers, factors, 5, native.build_index(centers, 5))
-    assert torch.equal(found[0], expected[0])
+    raw = torch.randn(60, dim, dim, generator=rng, dtype=F64)
+    kernel = Kernel(5, covariance_scale=3.0, min_lengthscale=0.5)
+    expected = nearest_features(points, centers, kernel_factors(raw, kernel), 5)
+    found = native.nearest_features(points, centers, raw, kernel, native.build_index(centers, 5))
+    assert torch.equal(found[0].long(), expected[0])
     torch.testing.assert_close(found[1], expected[1])

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import features
+from lardhm_torch.features import Kernel
 from lardhm_torch.native.build import available as library_available
 
 DIMENSIONS = (2, 3)
@@ -65,21 +66,40 @@ def nearest_centers(
 def occupancy(
     points: Tensor,
     centers: Tensor,
-    scale_tril: Tensor,
+    raw_scale_tril: Tensor,
     weights: Tensor,
-    num_neighbors: int,
+    kernel: Kernel,
     *,
     probability: bool,
     index: Tensor | None = None,
 ) -> Tensor:
-    """As `features.log_odds`, or its sigmoid; an index saves the time to make one."""
+    """As `features.log_odds` of `features.kernel_factors`, or its sigmoid.
+
+    An index saves the time to make one.
+    """
     if not supports(points):
-        answer = features.log_odds(points, centers, scale_tril, weights, num_neighbors)
+        factors = features.kernel_factors(raw_scale_tril, kernel)
+        answer = features.log_odds(points, centers, factors, weights, kernel.num_neighbors)
         return torch.sigmoid(answer) if probability else answer
-    index = build_index(centers, num_neighbors) if index is None else index
+    index = build_index(centers, kernel.num_neighbors) if index is None else index
     return torch.ops.lardhm.occupancy(
-        points, centers, scale_tril, weights, num_neighbors, index, probability
+        points, centers, raw_scale_tril, weights, *kernel, index, probability
     )
+
+
+def nearest_features(
+    points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As `features.nearest_features`, without gradients; indices are int32 where that is native."""
+    if supports(points):
+        given = (points, centers, raw_scale_tril, index)
+        return torch.ops.lardhm.nearest_features(*(t.detach() for t in given), *kernel)
+    factors = features.kernel_factors(raw_scale_tril, kernel)
+    chunks = [
+        features.nearest_features(chunk, centers, factors, kernel.num_neighbors)
+        for chunk in points.split(features.QUERY_CHUNK)
+    ]
+    return torch.cat([chunk[0] for chunk in chunks]), torch.cat([chunk[1] for chunk in chunks])
 
 
 def assign(
@@ -114,19 +134,10 @@ def assign(
     return labels, counts.to(dtype), sums.to(dtype), scatters.to(dtype)
 
 
-def nearest_features(
-    points: Tensor, centers: Tensor, scale_tril: Tensor, num_neighbors: int, index: Tensor
-) -> tuple[Tensor, Tensor]:
-    """As `features.nearest_features`, without gradients."""
-    indices = nearest_centers(points, centers, num_neighbors, index)
-    if not supports(points):
-        return indices, features.lard_kernel(points, centers, scale_tril, indices)
-    return indices, torch.ops.lardhm.kernel_values(points, centers, scale_tril, indices)
-
-
-def descends(values: Tensor) -> bool:
-    """Whether `torch.ops.lardhm.descent_pass` can train on these kept features."""
-    return values.device.type == "cpu" and values.dtype in DTYPES and available()
+def descends(indices: Tensor, values: Tensor) -> bool:
+    """Whether `torch.ops.lardhm.descent` can train on these features."""
+    fits = values.device.type == "cpu" and values.dtype in DTYPES
+    return fits and indices.dtype == torch.int32 and available()
 
 
 def _register() -> None:
@@ -142,14 +153,19 @@ def _register() -> None:
     def _(points: Tensor, centers: Tensor, k: int, index: Tensor) -> Tensor:
         return points.new_empty((points.shape[0], min(k, centers.shape[0])), dtype=torch.long)
 
+    @library.register_fake("lardhm::nearest_features")
+    def _(points: Tensor, centers: Tensor, raw: Tensor, index: Tensor, k: int, *_: Any) -> Any:
+        shape = (points.shape[0], min(k, centers.shape[0]))
+        return points.new_empty(shape, dtype=torch.int32), points.new_empty(shape)
+
     @library.register_fake("lardhm::occupancy")
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0])
 
     @library.register_fake("lardhm::occupancy_backward")
-    def _(grad: Tensor, points: Tensor, centers: Tensor, scale_tril: Tensor, weights: Tensor,
-          k: int, index: Tensor, probability: bool, wanted: int) -> tuple[Tensor, ...]:  # fmt: skip
-        inputs = (points, centers, scale_tril, weights)
+    def _(grad: Tensor, points: Tensor, centers: Tensor, raw: Tensor, weights: Tensor,
+          *settings: Any) -> tuple[Tensor, ...]:  # fmt: skip
+        inputs, wanted = (points, centers, raw, weights), settings[-1]
         return tuple(
             torch.empty_like(t) if wanted >> bit & 1 else t.new_empty(0)
             for bit, t in enumerate(inputs)
@@ -162,34 +178,51 @@ def _register() -> None:
         scatters = centers.new_empty(count if scatter else 0, dim, dim)
         return labels, centers.new_empty(count), torch.empty_like(centers), scatters
 
+    @library.register_fake("lardhm::kmeans")
+    def _(points: Tensor, start: Tensor, *_: Any) -> Tensor:
+        return torch.empty_like(start)
+
+    @library.register_fake("lardhm::z_order")
+    def _(points: Tensor) -> Tensor:
+        return points.new_empty(points.shape[0], dtype=torch.long)
+
+    @library.register_fake("lardhm::descent")
+    def _(indices: Tensor, values: Tensor, labels: Tensor, factors: Tensor, weights: Tensor,
+          *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
+        return tuple(torch.empty_like(weights) for _ in range(3))
+
     library.register_autograd("lardhm::occupancy", _backward, setup_context=_keep_inputs)
 
 
 def _keep_inputs(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    points, centers, scale_tril, weights, ctx.num_neighbors, index, ctx.probability = inputs
-    ctx.save_for_backward(points, centers, scale_tril, weights, index)
+    *tensors, k, scale, floor, index, ctx.probability = inputs
+    ctx.kernel = Kernel(k, scale, floor)
+    ctx.save_for_backward(*tensors, index)
 
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *inputs, index = ctx.saved_tensors
-    k, probability = ctx.num_neighbors, ctx.probability
+    needed = ctx.needs_input_grad[:4]
     if torch.is_grad_enabled():  # the gradient itself is to be differentiated
-        grads = _differentiable_gradients(grad, inputs, ctx.needs_input_grad, k, index, probability)
+        grads = _differentiable_gradients(grad, inputs, needed, ctx.kernel, ctx.probability)
     else:
-        wanted = sum(1 << bit for bit in range(4) if ctx.needs_input_grad[bit])
-        computed = torch.ops.lardhm.occupancy_backward(grad, *inputs, k, index, probability, wanted)
+        wanted = sum(1 << bit for bit in range(4) if needed[bit])
+        computed = torch.ops.lardhm.occupancy_backward(
+            grad, *inputs, *ctx.kernel, index, ctx.probability, wanted
+        )
         grads = [g if wanted >> bit & 1 else None for bit, g in enumerate(computed)]
-    return (*grads, None, None, None)
+    return (*grads, None, None, None, None, None)
 
 
 def _differentiable_gradients(
-    grad: Tensor, inputs: list[Tensor], needed: Any, k: int, index: Tensor, probability: bool
+    grad: Tensor, inputs: list[Tensor], needed: Any, kernel: Kernel, probability: bool
 ) -> list[Tensor | None]:
-    points, centers, scale_tril, weights = inputs
-    indices = nearest_centers(points, centers, k, index)
-    values = features.lard_kernel(points, centers, scale_tril, indices)
+    points, centers, raw_scale_tril, weights = inputs
+    indices = nearest_centers(points, centers, kernel.num_neighbors)
+    factors = features.kernel_factors(raw_scale_tril, kernel)
+    values = features.lard_kernel(points, centers, factors, indices)
     answer = (values * weights[indices]).sum(dim=1)
     answer = torch.sigmoid(answer) if probability else answer
-    asked = [tensor for tensor, need in zip(inputs, needed[:4], strict=True) if need]
+    asked = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
     found = iter(torch.autograd.grad(answer, asked, grad, create_graph=True))
-    return [next(found) if need else None for need in needed[:4]]
+    return [next(found) if need else None for need in needed]

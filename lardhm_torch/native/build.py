@@ -11,21 +11,23 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
 
-SOURCES = tuple(Path(__file__).with_name(name) for name in ("kernel.cpp", "descent.cpp"))
+FOLDER = Path(__file__).parent
 FLAGS = (
     "-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno",
     "-fno-trapping-math", "-fno-tree-slp-vectorize",  # packs neighbors through memory, and stalls
-    "-fPIC", "-shared", "-w", "-DTORCH_TARGET_VERSION=0x020a000000000000",
+    "-fPIC", "-w", "-DTORCH_TARGET_VERSION=0x020a000000000000",
 )  # fmt: skip
 COMPILERS = ("c++", "g++", "clang++")
 OFF = ("0", "false", "off", "no")
@@ -89,12 +91,13 @@ def _cached_library() -> Path:
     raise OSError("no folder for the compiled kernel is writable; set LARDHM_CACHE to one")
 
 
-def _compiler() -> str:
-    named = os.environ.get("CXX")
-    for candidate in (named,) if named else COMPILERS:
-        if found := shutil.which(candidate):
-            return found
-    raise OSError(f"no C++ compiler found (looked for {named or ', '.join(COMPILERS)})")
+def _compiler() -> list[str]:
+    """The compiler's command, with its arguments where ``CXX`` has some ("ccache g++")."""
+    named = shlex.split(os.environ.get("CXX", ""))
+    for program, *arguments in [named] if named else [[name] for name in COMPILERS]:
+        if found := shutil.which(program):
+            return [found, *arguments]
+    raise OSError(f"no C++ compiler found (looked for {' '.join(named) or ', '.join(COMPILERS)})")
 
 
 def _cache_folders() -> list[Path]:
@@ -103,11 +106,11 @@ def _cache_folders() -> list[Path]:
     return [home, Path(tempfile.gettempdir()) / f"lardhm_torch-{os.getuid()}"]
 
 
-def _cache_key(compiler: str) -> str:
+def _cache_key(compiler: list[str]) -> str:
     parts = [
-        *(source.read_bytes() for source in SOURCES),
+        *(path.read_bytes() for path in sorted(FOLDER.iterdir()) if path.suffix in (".cpp", ".h")),
         torch.__version__.encode(),
-        " ".join((compiler, *FLAGS)).encode(),
+        " ".join((*compiler, *FLAGS)).encode(),
         f"{sys.platform} {platform.machine()}".encode(),
         _processor_flags(),
     ]
@@ -124,13 +127,26 @@ def _processor_flags() -> bytes:
     return b"\n".join(sorted({line for line in lines if line.startswith(wanted)}))
 
 
-def _compile(compiler: str, target: Path) -> None:
+def _compile(compiler: list[str], target: Path) -> None:
+    """Every source by itself, as many at once as there are processors, then one library of all."""
     root = Path(torch.__file__).parent
-    command = [
-        compiler, *FLAGS, f"-isystem{root / 'include'}", *map(str, SOURCES), "-o", str(target),
+    sources = sorted(FOLDER.glob("*.cpp"), reverse=True)  # the largest is the last by name
+    objects = [target.with_name(f"{source.stem}.o") for source in sources]
+    commands = [
+        [*compiler, *FLAGS, f"-isystem{root / 'include'}", "-c", str(source), "-o", str(made)]
+        for source, made in zip(sources, objects, strict=True)
+    ]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(_run, commands, objects))
+    link = [
+        *compiler, "-shared", *map(str, objects), "-o", str(target),
         f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu", "-lc10",
     ]  # fmt: skip
+    _run(link, target)
+
+
+def _run(command: list[str], made: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    if done.returncode or not target.is_file():
+    if done.returncode or not made.is_file():
         lines = [line for line in done.stderr.splitlines() if "error" in line] or ["no output"]
-        raise OSError(f"{compiler} failed with exit code {done.returncode}: {lines[0]}")
+        raise OSError(f"{command[0]} failed with exit code {done.returncode}: {lines[0]}")

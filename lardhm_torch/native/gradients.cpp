@@ -1,0 +1,185 @@
+// Gradients of the log-odds or the probability, by points, centers, raw factors and weights.
+
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "kernel.h"
+#include "tensors.h"
+
+namespace lardhm {
+namespace {
+
+enum Wanted { kPoints = 1, kCenters = 2, kScaleTril = 4, kWeights = 8 };
+
+// Gradients: `sums` holds, for each cluster by rank, those of weight, center and factor.
+template <class T, int D>
+struct BackwardVisitor final : Visitor<T, D> {
+  using V = typename Simd<T>::V;
+  using L = Layout<D>;
+  const T *positions, *shapes, *grad;
+  bool probability;
+  int64_t wanted;
+  T *grad_points, *sums;
+  std::vector<char> bytes;
+
+  BackwardVisitor(const Parameters<T, D>& parameters, const T* grad_, bool probability_,
+                  int64_t wanted_, T* grad_points_, T* sums_)
+      : positions(parameters.positions.data), shapes(parameters.shapes.data), grad(grad_),
+        probability(probability_), wanted(wanted_), grad_points(grad_points_), sums(sums_) {}
+
+  void invalid(int64_t row) override {
+    if (!(wanted & kPoints)) return;
+    for (int d = 0; d < D; ++d) grad_points[row * D + d] = std::numeric_limits<T>::quiet_NaN();
+  }
+
+  void packet(const Packet<T, D>& packet, const Selection& selected) override {
+    bytes.resize((selected.size + 1) * (D + 1) * sizeof(V) + 64);
+    V* terms = reinterpret_cast<V*>((reinterpret_cast<uintptr_t>(bytes.data()) + 63) / 64 * 64);
+    const V g = incoming(packet, selected, terms);
+    V towards[D] = {};
+    for (int64_t j = 0; j < selected.size; ++j)
+      cluster(selected.rank[j], g, terms + j * (D + 1), towards);
+    if (!(wanted & kPoints)) return;
+    for (int lane = 0; lane < packet.lanes; ++lane)
+      for (int d = 0; d < D; ++d) grad_points[packet.row(lane) * D + d] = -towards[d][lane];
+  }
+
+  // Gradient that reaches the log-odds; the terms of a cluster are z and the masked kernel value.
+  V incoming(const Packet<T, D>& packet, const Selection& selected, V* terms) const {
+    V sum = {}, g = {};
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
+      V* z = terms + j * (D + 1);
+      whiten<T, D>(packet, positions + int64_t(selected.rank[j]) * L::position, shape, z);
+      z[D] = mask_of<T>(selected.bits[j]) ? kernel_of<T, D>(z) : V{};
+      sum += z[D] * shape[L::weight];
+    }
+    for (int lane = 0; lane < packet.lanes; ++lane) g[lane] = grad[packet.row(lane)];
+    if (!probability) return g;
+    const V p = sigmoid<T>(sum);
+    return g * p * sigmoid<T>(-sum);
+  }
+
+  // Adds one cluster's share; y = inv(L)^T z, d log_odds / dc = w phi y, dL = w phi y z^T.
+  void cluster(int32_t rank, V g, const V* z, V* towards) {
+    const T* shape = shapes + int64_t(rank) * L::shape;
+    T* sum = sums + int64_t(rank) * L::gradient;
+    const V by_weight = g * z[D];
+    if (wanted & kWeights) sum[0] += sum_lanes<T>(by_weight);
+    if (!(wanted & (kPoints | kCenters | kScaleTril))) return;
+    const T* below = shape + L::below;
+    const V share = by_weight * shape[L::weight];
+    V y[D];
+    y[D - 1] = share * z[D - 1] * shape[D - 1];
+    if constexpr (D == 3) y[1] = (share * z[1] - y[2] * below[2]) * shape[1];
+    y[0] = share * z[0] - y[1] * below[0];
+    if constexpr (D == 3) y[0] -= y[2] * below[1];
+    y[0] *= shape[0];
+    for (int d = 0; d < D; ++d) towards[d] += y[d];
+    if (wanted & kCenters)
+      for (int d = 0; d < D; ++d) sum[1 + d] += sum_lanes<T>(y[d]);
+    if (!(wanted & kScaleTril)) return;
+    T* factor = sum + 1 + D;
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j) *factor++ += sum_lanes<T>(y[i] * z[j]);
+  }
+};
+
+// From the kernel's factor L to the raw one: the diagonal is its logarithm, and flat at the floor.
+template <class T, int D>
+void raw_gradient(const Parameters<T, D>& parameters, int64_t rank, const T* factor, T* raw) {
+  const T* shape = parameters.shapes.data + rank * Layout<D>::shape;
+  const T* given = parameters.raw + int64_t(parameters.index.order[rank]) * D * D;
+  const T log_floor = std::log(parameters.floor);
+  for (int i = 0; i < D; ++i)
+    for (int j = 0; j <= i; ++j, ++factor)
+      raw[i * D + j] = j < i                           ? *factor * parameters.scale
+                       : given[i * D + i] >= log_floor ? *factor / shape[i]
+                                                       : T(0);
+}
+
+// Sums of the parts, from rank order to the tensors' rows.
+template <class T, int D>
+void scatter_gradients(const Parameters<T, D>& parameters, const T* sums, int64_t parts, T* weights,
+                       T* centers, T* raw) {
+  using L = Layout<D>;
+  const int64_t count = parameters.index.header.count;
+  run_tasks((count + kPackGrain - 1) / kPackGrain, [&](int64_t task) {
+    const int64_t end = std::min(count, (task + 1) * kPackGrain);
+    for (int64_t rank = task * kPackGrain; rank < end; ++rank) {
+      if (!parameters.packed.empty() && !parameters.packed[rank / kBlock]) continue;
+      T sum[L::gradient] = {};
+      for (int64_t part = 0; part < parts; ++part)
+        for (int i = 0; i < L::gradient; ++i)
+          sum[i] += sums[(part * count + rank) * L::gradient + i];
+      const int64_t row = parameters.index.order[rank];
+      if (weights) weights[row] = sum[0];
+      for (int d = 0; centers && d < D; ++d) centers[row * D + d] = sum[1 + d];
+      if (raw) raw_gradient<T, D>(parameters, rank, sum + 1 + D, raw + row * D * D);
+    }
+  });
+}
+
+using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+
+Tensor like_or_empty(const Tensor& tensor, bool wanted) {
+  return wanted ? torch::stable::new_zeros(tensor, tensor.sizes())
+                : torch::stable::new_empty(tensor, {0});
+}
+
+
+Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_points,
+                             const Tensor& centers, const Tensor& raw, const Tensor& weights,
+                             int64_t k, double covariance_scale, double min_lengthscale,
+                             const Tensor& index, bool probability, int64_t wanted) {
+  check_k(k);
+  const Tensor grad = tidy(given_grad), points = tidy(given_points);
+  check_rows("points", points, centers);
+  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  STD_TORCH_CHECK(grad.dim() == 1 && grad.size(0) == points.size(0) &&
+                      grad.scalar_type() == points.scalar_type(),
+                  "grad must be (N,), one per point, of the points' dtype");
+  const int64_t count = centers.size(0), n = points.size(0);
+  const Gradients result{
+      like_or_empty(points, wanted & kPoints), like_or_empty(map.centers, wanted & kCenters),
+      like_or_empty(map.raw, wanted & kScaleTril), like_or_empty(map.weights, wanted & kWeights)};
+  k = std::min(k, count);
+  if (k == 0 || n == 0) return result;
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    with_parameters<T, dim()>(map, n, [&](Parameters<T, dim()>& parameters) {
+      const int64_t size = count * Layout<dim()>::gradient;
+      const int64_t parts = parts_of(n, size * sizeof(T), parameters);
+      std::vector<T> sums((wanted & ~kPoints) ? size * parts : 0);
+      visit_parts<T, dim()>(in<T>(points), n, parameters, k, parts, [&](int64_t part) {
+        return std::make_unique<BackwardVisitor<T, dim()>>(
+            parameters, in<T>(grad), probability, wanted,
+            (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr, sums.data() + part * size);
+      });
+      if (wanted & ~kPoints)
+        scatter_gradients<T, dim()>(parameters, sums.data(), parts,
+                                    (wanted & kWeights) ? out<T>(std::get<3>(result)) : nullptr,
+                                    (wanted & kCenters) ? out<T>(std::get<1>(result)) : nullptr,
+                                    (wanted & kScaleTril) ? out<T>(std::get<2>(result)) : nullptr);
+    });
+    return 0;
+  });
+  return result;
+}
+
+}  // namespace
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def(
+      "occupancy_backward(Tensor grad, Tensor points, Tensor centers, Tensor raw_scale_tril, "
+      "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
+      "bool probability, int wanted) -> (Tensor, Tensor, Tensor, Tensor)");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
+  m.impl("occupancy_backward", TORCH_BOX(&lardhm::occupancy_backward));
+}

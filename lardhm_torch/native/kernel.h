@@ -1,0 +1,36 @@
+// The LARD kernel of a packet and one cluster: phi(x) = exp(-|inv(L) (x - c)|^2 / 2).
+
+#pragma once
+
+#include <cstring>
+
+#include "packets.h"
+
+namespace lardhm {
+
+// Whitened offset z = inv(L) (x - c) of a packet from one cluster.
+template <class T, int D>
+inline void whiten(const Packet<T, D>& packet, const T* center, const T* shape,
+                   typename Simd<T>::V* z) {
+  const T* below = shape + Layout<D>::below;
+  z[0] = (packet.x[0] - center[0]) * shape[0];
+  z[1] = ((packet.x[1] - center[1]) - z[0] * below[0]) * shape[1];
+  if constexpr (D == 3)
+    z[2] = ((packet.x[2] - center[2]) - z[0] * below[1] - z[1] * below[2]) * shape[2];
+}
+
+template <class T, int D>
+inline typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
+  typename Simd<T>::V squared = z[0] * z[0];
+  for (int d = 1; d < D; ++d) squared += z[d] * z[d];
+  return exp_of<T>(squared * T(-0.5));
+}
+
+template <class T, int D>
+inline void store_rows(typename Simd<T>::V value, const Packet<T, D>& packet, T* to) {
+  T lane_value[Simd<T>::W];
+  std::memcpy(lane_value, &value, sizeof(value));
+  for (int lane = 0; lane < packet.lanes; ++lane) to[packet.row(lane)] = lane_value[lane];
+}
+
+}  // namespace lardhm

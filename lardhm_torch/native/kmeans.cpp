@@ -1,0 +1,237 @@
+// k-means: points to their nearest centers, moments of the points of each, centers that follow them.
+
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "sorting.h"
+#include "tensors.h"
+
+namespace lardhm {
+namespace {
+
+// k = 1: the own center of every point, and the moments of the offsets from it.
+template <class T, int D>
+struct AssignVisitor final : Visitor<T, D> {
+  static constexpr int kMoments = 1 + D + D * (D + 1) / 2;
+  const int32_t* order;
+  const T* positions;
+  bool scatter;
+  int64_t* labels;  // may be null
+  double* sums;  // (M, kMoments) by rank: count, offsets, lower triangle of their products
+
+  AssignVisitor(const Parameters<T, D>& parameters, bool scatter_, int64_t* labels_, double* sums_)
+      : order(parameters.index.order), positions(parameters.positions.data), scatter(scatter_),
+        labels(labels_), sums(sums_) {}
+
+  void invalid(int64_t row) override {
+    if (labels) labels[row] = -1;
+  }
+
+  void packet(const Packet<T, D>& packet, const Selection& selected) override {
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const int64_t rank = selected.rank[j];
+      const T* center = positions + rank * Layout<D>::position;
+      for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
+        const int lane = __builtin_ctz(bits);
+        if (labels) labels[packet.row(lane)] = order[rank];
+        T offset[D];
+        for (int d = 0; d < D; ++d) offset[d] = packet.x[d][lane] - center[d];
+        add(offset, sums + rank * kMoments);
+      }
+    }
+  }
+
+  void add(const T* offset, double* to) const {
+    to[0] += 1;
+    for (int d = 0; d < D; ++d) to[1 + d] += offset[d];
+    if (!scatter) return;
+    double* product = to + 1 + D;
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j) *product++ += double(offset[i]) * double(offset[j]);
+  }
+};
+
+// Moments of n points by the rank of their nearest center, in as many parts as are worth it.
+template <class T, int D>
+struct MomentSums {
+  static constexpr int kMoments = AssignVisitor<T, D>::kMoments;
+  const Index& index;
+  int64_t parts;
+  std::vector<double> sums;
+
+  MomentSums(const T* points, int64_t n, const T* centers, const Index& index_, bool scatter,
+             int64_t* labels)
+      : index(index_) {
+    Parameters<T, D> parameters(index, centers, nullptr, nullptr, {},
+                                n >= index.header.count / kPointsOfFew);
+    const int64_t size = index.header.count * kMoments;
+    parts = parts_of(n, size * sizeof(double), parameters);
+    sums.resize(size * parts);
+    visit_parts<T, D>(points, n, parameters, 1, parts, [&](int64_t part) {
+      return std::make_unique<AssignVisitor<T, D>>(parameters, scatter, labels,
+                                                   sums.data() + part * size);
+    });
+  }
+
+  // The first `moments` of one center.
+  void total(int64_t rank, int moments, double* sum) const {
+    for (int i = 0; i < moments; ++i) sum[i] = 0;
+    for (int64_t part = 0; part < parts; ++part)
+      for (int i = 0; i < moments; ++i)
+        sum[i] += sums[(part * index.header.count + rank) * kMoments + i];
+  }
+};
+
+// Sums of the parts as tensors: counts, offsets, symmetric scatters.
+template <class T, int D>
+void scatter_moments(const MomentSums<T, D>& moments, T* counts, T* offsets, T* scatters) {
+  for (int64_t rank = 0; rank < moments.index.header.count; ++rank) {
+    double sum[MomentSums<T, D>::kMoments];
+    moments.total(rank, MomentSums<T, D>::kMoments, sum);
+    const int64_t row = moments.index.order[rank];
+    counts[row] = T(sum[0]);
+    for (int d = 0; d < D; ++d) offsets[row * D + d] = T(sum[1 + d]);
+    const double* product = sum + 1 + D;
+    for (int i = 0; scatters && i < D; ++i)
+      for (int j = 0; j <= i; ++j, ++product)
+        scatters[(row * D + i) * D + j] = scatters[(row * D + j) * D + i] = T(*product);
+  }
+}
+
+using Moments = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+
+Moments assign(const Tensor& given_points, const Tensor& given_centers, const Tensor& given_index,
+               bool scatter) {
+  const Tensor points = tidy(given_points), centers = tidy(given_centers);
+  const Tensor index = usable_index(given_index);
+  check_rows("points", points, centers);
+  const int64_t count = centers.size(0), dim_size = centers.size(1), n = points.size(0);
+  STD_TORCH_CHECK(count > 0, "centers must hold at least one row");
+  const Moments result{torch::stable::new_empty(points, {n}, ScalarType::Long),
+                       torch::stable::new_zeros(points, {count}),
+                       torch::stable::new_zeros(points, {count, dim_size}),
+                       torch::stable::new_zeros(points, {scatter ? count : 0, dim_size, dim_size})};
+  if (n == 0) return result;
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    const CallIndex<T, dim()> call(index, in<T>(centers), count);
+    const MomentSums<T, dim()> moments(in<T>(points), n, in<T>(centers), call.index, scatter,
+                                       out<int64_t>(std::get<0>(result)));
+    scatter_moments<T, dim()>(moments, out<T>(std::get<1>(result)), out<T>(std::get<2>(result)),
+                              scatter ? out<T>(std::get<3>(result)) : nullptr);
+    return 0;
+  });
+  return result;
+}
+
+void check_row_numbers(const Tensor& rows, int64_t count) {
+  STD_TORCH_CHECK(rows.scalar_type() == ScalarType::Long, "rows must be int64");
+  const int64_t* row = in<int64_t>(rows);
+  const int64_t entries = rows.numel();
+  uint64_t largest = 0;
+  for (int64_t i = 0; i < entries; ++i) largest = std::max(largest, uint64_t(row[i]));
+  STD_TORCH_CHECK(entries == 0 || largest < uint64_t(count), "row out of range");
+}
+
+// One batch: every point pulls its nearest center; `met` is how many pulled it since the restart.
+template <class T, int D>
+void pull_centers(const std::vector<T>& batch, T* centers, int64_t count, std::vector<T>& met) {
+  AlignedArray<char> bytes;
+  build_index<T, D>(centers, count, [&](int64_t size) {
+    bytes.allocate(size);
+    return bytes.data;
+  });
+  const Index index = view_of(bytes.data);
+  const MomentSums<T, D> moments(batch.data(), batch.size() / D, centers, index, false, nullptr);
+  for (int64_t rank = 0; rank < count; ++rank) {
+    double sum[1 + D];
+    moments.total(rank, 1 + D, sum);
+    const int64_t row = index.order[rank];
+    met[row] += T(sum[0]);
+    for (int d = 0; d < D; ++d) centers[row * D + d] += T(sum[1 + d]) / std::max(met[row], T(1));
+  }
+}
+
+Tensor kmeans(const Tensor& given_points, const Tensor& given_start, const Tensor& given_rows,
+              int64_t batch_size, int64_t restart_every) {
+  const Tensor points = tidy(given_points), start = tidy(given_start), rows = tidy(given_rows);
+  check_rows("points", points, start);
+  check_row_numbers(rows, points.size(0));
+  STD_TORCH_CHECK(batch_size >= 1 && restart_every >= 1 && start.size(0) >= 1,
+                  "batch_size, restart_every and the number of centers must be 1 or more");
+  const Tensor centers = torch::stable::new_empty(start, start.sizes());
+  dispatch(start, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    std::memcpy(out<T>(centers), in<T>(start), start.numel() * sizeof(T));
+    std::vector<T> met(start.size(0)), batch;
+    const T* from = in<T>(points);
+    const int64_t *row = in<int64_t>(rows), drawn = rows.numel();
+    for (int64_t begin = 0, step = 0; begin < drawn; begin += batch_size, ++step) {
+      if (step % restart_every == 0) std::fill(met.begin(), met.end(), T(0));
+      const int64_t n = std::min(batch_size, drawn - begin);
+      batch.resize(n * D);
+      for (int64_t i = 0; i < n; ++i)
+        std::memcpy(batch.data() + i * D, from + row[begin + i] * D, D * sizeof(T));
+      pull_centers<T, D>(batch, out<T>(centers), start.size(0), met);
+    }
+    return 0;
+  });
+  return centers;
+}
+
+// Places along a Z curve of 2^10 cells an axis, as in `clustering.z_order`; ties keep their order.
+Tensor z_order(const Tensor& given_points) {
+  const Tensor points = tidy(given_points);
+  const int64_t n = points.size(0);
+  const Tensor order = torch::stable::new_empty(points, {n}, ScalarType::Long);
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim(), kBits = 10;
+    Box<T, D> box;
+    box.add(in<T>(points), 0, n, 1);
+    T edge = std::numeric_limits<T>::min();
+    for (int d = 0; d < D; ++d) edge = std::max(edge, box.high[d] - box.low[d]);
+    uint32_t spread[1 << kBits] = {};
+    for (int cell = 0; cell < 1 << kBits; ++cell)
+      for (int bit = 0; bit < kBits; ++bit) spread[cell] |= uint32_t(cell >> bit & 1) << bit * D;
+    Sorter sorter;
+    sorter.items.resize(n);
+    const T* from = in<T>(points);
+    for (int64_t i = 0; i < n; ++i) {
+      uint32_t key = 0;
+      for (int d = 0; d < D; ++d) {
+        const T at = (from[i * D + d] - box.low[d]) / edge * T((1 << kBits) - 1);
+        key |= spread[at > 0 ? std::min(int32_t(at), (1 << kBits) - 1) : 0] << d;
+      }
+      sorter.items[i] = uint64_t(key) << 32 | uint64_t(i);
+    }
+    sorter.sort(kBits * D);
+    int64_t* to = out<int64_t>(order);
+    for (int64_t i = 0; i < n; ++i) to[i] = int64_t(uint32_t(sorter.items[i]));
+    return 0;
+  });
+  return order;
+}
+
+}  // namespace
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def(
+      "assign(Tensor points, Tensor centers, Tensor index, bool scatter) "
+      "-> (Tensor, Tensor, Tensor, Tensor)");
+  m.def(
+      "kmeans(Tensor points, Tensor start, Tensor rows, int batch_size, int restart_every) "
+      "-> Tensor");
+  m.def("z_order(Tensor points) -> Tensor");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
+  m.impl("assign", TORCH_BOX(&lardhm::assign));
+  m.impl("kmeans", TORCH_BOX(&lardhm::kmeans));
+  m.impl("z_order", TORCH_BOX(&lardhm::z_order));
+}

@@ -1,0 +1,227 @@
+// Queries: the index, the k nearest centers, their kernel values, log-odds and probability.
+
+#include <cstdint>
+#include <limits>
+#include <tuple>
+
+#include "kernel.h"
+#include "tensors.h"
+
+namespace lardhm {
+namespace {
+
+template <class T, int D>
+struct OccupancyVisitor final : Visitor<T, D> {
+  using V = typename Simd<T>::V;
+  const T *positions, *shapes;
+  bool probability;
+  T* out;
+
+  OccupancyVisitor(const Parameters<T, D>& parameters, bool probability_, T* out_)
+      : positions(parameters.positions.data), shapes(parameters.shapes.data),
+        probability(probability_), out(out_) {}
+
+  void invalid(int64_t row) override { out[row] = std::numeric_limits<T>::quiet_NaN(); }
+
+  void packet(const Packet<T, D>& packet, const Selection& selected) override {
+    using L = Layout<D>;
+    V sum = {};
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
+      V z[D];
+      whiten<T, D>(packet, positions + int64_t(selected.rank[j]) * L::position, shape, z);
+      const V term = kernel_of<T, D>(z) * shape[L::weight];
+      sum = mask_of<T>(selected.bits[j]) ? sum + term : sum;
+    }
+    store_rows<T, D>(probability ? sigmoid<T>(sum) : sum, packet, out);
+  }
+};
+
+// Neighbors of each point, ascending by row of the centers, and their kernel values where asked.
+template <class T, int D, class Integer>
+struct NeighborVisitor final : Visitor<T, D> {
+  using V = typename Simd<T>::V;
+  const int32_t* order;
+  const T *positions, *shapes;
+  int64_t k;
+  Integer* rows;
+  T* values;  // may be null
+
+  NeighborVisitor(const Parameters<T, D>& parameters, int64_t k_, Integer* rows_, T* values_)
+      : order(parameters.index.order), positions(parameters.positions.data),
+        shapes(parameters.shapes.data), k(k_), rows(rows_), values(values_) {}
+
+  void invalid(int64_t row) override {
+    for (int64_t j = 0; j < k; ++j) {
+      rows[row * k + j] = Integer(j);
+      if (values) values[row * k + j] = std::numeric_limits<T>::quiet_NaN();
+    }
+  }
+
+  void packet(const Packet<T, D>& packet, const Selection& selected) override {
+    int64_t filled[Simd<T>::W] = {};
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const int64_t rank = selected.rank[j];
+      T value[Simd<T>::W];
+      if (values) {
+        V z[D];
+        whiten<T, D>(packet, positions + rank * Layout<D>::position,
+                     shapes + rank * Layout<D>::shape, z);
+        const V kernel = kernel_of<T, D>(z);
+        std::memcpy(value, &kernel, sizeof(kernel));
+      }
+      for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
+        const int lane = __builtin_ctz(bits);
+        insert(packet.row(lane) * k, filled[lane]++, Integer(order[rank]), value[lane]);
+      }
+    }
+  }
+
+  void insert(int64_t first, int64_t n, Integer row, T value) const {
+    Integer* sorted = rows + first;
+    T* beside = values + first;
+    for (; n > 0 && sorted[n - 1] > row; --n) {
+      sorted[n] = sorted[n - 1];
+      if (values) beside[n] = beside[n - 1];
+    }
+    sorted[n] = row;
+    if (values) beside[n] = value;
+  }
+};
+
+Tensor make_index(const Tensor& given_centers, int64_t k) {
+  check_k(k);
+  const Tensor centers = tidy(given_centers);
+  Tensor index;
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    build_index<T, dim()>(in<T>(centers), centers.size(0), [&](int64_t size) {
+      index = torch::stable::new_empty(centers, {size}, ScalarType::Byte);
+      return out<char>(index);
+    });
+    return 0;
+  });
+  return index;
+}
+
+bool index_matches(const Tensor& index, const Tensor& given_centers, int64_t k) {
+  check_k(k);
+  if (index.scalar_type() != ScalarType::Byte || !index.is_contiguous()) return false;
+  const Tensor centers = tidy(given_centers);
+  return dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    return matches<T, dim()>(in<char>(index), index.numel(), in<T>(centers), centers.size(0));
+  });
+}
+
+Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t k,
+               const Tensor& given_index) {
+  check_k(k);
+  const Tensor points = tidy(given_points), centers = tidy(given_centers);
+  const Tensor index = usable_index(given_index);
+  check_rows("points", points, centers);
+  k = std::min(k, centers.size(0));
+  const int64_t n = points.size(0);
+  const Tensor rows = torch::stable::new_empty(points, {n, k}, ScalarType::Long);
+  if (k == 0) return rows;
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    const CallIndex<T, dim()> call(index, in<T>(centers), centers.size(0));
+    Parameters<T, dim()> parameters(call.index, in<T>(centers), nullptr, nullptr, {},
+                                    n >= centers.size(0) / kPointsOfFew);
+    visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
+      return std::make_unique<NeighborVisitor<T, dim(), int64_t>>(parameters, k,
+                                                                  out<int64_t>(rows), nullptr);
+    });
+    return 0;
+  });
+  return rows;
+}
+
+std::tuple<Tensor, Tensor> nearest_features(const Tensor& given_points, const Tensor& centers,
+                                            const Tensor& raw, const Tensor& index, int64_t k,
+                                            double covariance_scale, double min_lengthscale) {
+  check_k(k);
+  const Tensor points = tidy(given_points);
+  check_rows("points", points, centers);
+  const Tensor weights = torch::stable::new_zeros(centers, {centers.size(0)});
+  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  k = std::min(k, centers.size(0));
+  const int64_t n = points.size(0);
+  const Tensor rows = torch::stable::new_empty(points, {n, k}, ScalarType::Int);
+  const Tensor values = torch::stable::new_empty(points, {n, k});
+  if (k == 0) return {rows, values};
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    with_parameters<T, dim()>(map, n, [&](Parameters<T, dim()>& parameters) {
+      visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
+        return std::make_unique<NeighborVisitor<T, dim(), int32_t>>(
+            parameters, k, out<int32_t>(rows), out<T>(values));
+      });
+    });
+    return 0;
+  });
+  return {rows, values};
+}
+
+// Log-odds of an empty map: 0, and NaN where a coordinate is not finite.
+template <class T>
+void occupancy_of_nothing(const Tensor& points, bool probability, T* to) {
+  const int64_t dim = points.size(1), n = points.size(0);
+  const T* from = in<T>(points);
+  for (int64_t row = 0; row < n; ++row) {
+    T value = probability ? T(0.5) : T(0);
+    for (int64_t d = 0; d < dim; ++d) value += from[row * dim + d] * T(0);
+    to[row] = value;
+  }
+}
+
+Tensor occupancy(const Tensor& given_points, const Tensor& centers, const Tensor& raw,
+                 const Tensor& weights, int64_t k, double covariance_scale,
+                 double min_lengthscale, const Tensor& index, bool probability) {
+  check_k(k);
+  const Tensor points = tidy(given_points);
+  check_rows("points", points, centers);
+  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  k = std::min(k, centers.size(0));
+  const Tensor values = torch::stable::new_empty(points, {points.size(0)});
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    if (k == 0) {
+      occupancy_of_nothing<T>(points, probability, out<T>(values));
+      return 0;
+    }
+    const int64_t n = points.size(0);
+    with_parameters<T, dim()>(map, n, [&](Parameters<T, dim()>& parameters) {
+      visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
+        return std::make_unique<OccupancyVisitor<T, dim()>>(parameters, probability,
+                                                            out<T>(values));
+      });
+    });
+    return 0;
+  });
+  return values;
+}
+
+}  // namespace
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def("build_index(Tensor centers, int k) -> Tensor");
+  m.def("index_matches(Tensor index, Tensor centers, int k) -> bool");
+  m.def("nearest(Tensor points, Tensor centers, int k, Tensor index) -> Tensor");
+  m.def(
+      "nearest_features(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
+      "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
+  m.def(
+      "occupancy(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor weights, int k, "
+      "float covariance_scale, float min_lengthscale, Tensor index, bool probability) -> Tensor");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
+  m.impl("build_index", TORCH_BOX(&lardhm::make_index));
+  m.impl("index_matches", TORCH_BOX(&lardhm::index_matches));
+  m.impl("nearest", TORCH_BOX(&lardhm::nearest));
+  m.impl("nearest_features", TORCH_BOX(&lardhm::nearest_features));
+  m.impl("occupancy", TORCH_BOX(&lardhm::occupancy));
+}

@@ -1,0 +1,45 @@
+// Search: the exact k nearest centers of every point, packet by packet, shown to visitors.
+
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <functional>
+#include <memory>
+
+#include "packets.h"
+
+namespace lardhm {
+
+// What is done with a packet and the clusters it selected, or with a point that is not finite.
+template <class T, int D>
+struct Visitor {
+  virtual ~Visitor() = default;
+  virtual void invalid(int64_t row) = 0;
+  virtual void packet(const Packet<T, D>& packet, const Selection& selected) = 0;
+};
+
+template <class T, int D>
+using MakeVisitor = std::function<std::unique_ptr<Visitor<T, D>>(int64_t)>;
+
+// Shows every point with its k nearest centers once, to one visitor a thread.
+template <class T, int D>
+void visit_all(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
+               const MakeVisitor<T, D>& make);
+
+// The same in parts of the points in a fixed order, each with a visitor of its own: what they sum
+// depends on the number of parts, not on the threads' timing.
+template <class T, int D>
+void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k, int64_t parts,
+                 const MakeVisitor<T, D>& make);
+
+// How many parts to sum in: one a thread, fewer where the sums outweigh the work.
+template <class T, int D>
+int64_t parts_of(int64_t n, int64_t bytes_of_sums, const Parameters<T, D>& parameters) {
+  if (!parameters.packed.empty()) return 1;
+  const int64_t by_work = (n + 1023) / 1024;
+  const int64_t by_memory = (int64_t(1) << 29) / std::max<int64_t>(bytes_of_sums, 1);
+  return std::max<int64_t>(1, std::min({num_threads(), by_work, by_memory}));
+}
+
+}  // namespace lardhm
