@@ -16,7 +16,7 @@ from lardhm_torch.native import nearest_centers
 
 POINTS_PER_CLUSTER = 20  # of the rule that chooses the number of clusters
 MAX_CHOSEN = 3000  # a class
-START_POINTS = 100  # a center, drawn at random, among which the start is chosen
+START_POINTS = 50  # a center, drawn at random, among which the start is chosen
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
@@ -58,7 +58,9 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     centers = mini_batch_kmeans(points, num_clusters, rng)
     _, counts, sums, scatters = native.assign(points, centers)
     clusters = merge_small(clusters_about(centers, counts, sums, scatters))
-    order = z_order(clusters.means)  # neighbors in space are neighbors in memory: queries are faster
+    order = z_order(
+        clusters.means
+    )  # neighbors in space are neighbors in memory: queries are faster
     return Clusters(clusters.counts[order], clusters.means[order], clusters.scatters[order])
 
 

@@ -15,7 +15,7 @@ from lardhm_torch import native
 CHUNK_ROWS = 1 << 20  # points whose features are computed at a time
 CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
 State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the slope
-FeaturesOf = Callable[[Tensor], tuple[Tensor, Tensor]]
+FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,23 +73,21 @@ def fit_weights(
     labels: Tensor,
     weights: Tensor,
     config: FitConfig,
-    rng: torch.Generator,
     progress: bool = False,
 ) -> Tensor:
     """Weights that minimize the regularized loss, from the given start.
 
     w <- w - eta_t A^-1 g, with g the gradient of a batch scaled to all points. The preconditioner
     A is the running root mean square of g, and g is smoothed over steps (Adam), so that weights of
-    rarely seen clusters learn as fast as others. Points are shuffled once; every pass takes them in
-    that order. Features are computed once and kept up to `CACHE_BYTES`, the others anew in every
-    pass.
+    rarely seen clusters learn as fast as others. Every pass takes the points in the order given, so
+    **shuffle them first**. Features are computed once and kept up to `CACHE_BYTES`, the others anew
+    in every pass.
 
     Args:
-        features_of: rows (B,) -> indices (B, K) and kernel values (B, K) of those points.
-        labels: (N,) 1 occupied, 0 free.
+        features_of: slice of B rows -> indices (B, K) and kernel values (B, K) of those points.
+        labels: (N,) 1 occupied, 0 free, in random order.
         weights: (M,) start, left as it is.
         config: passes, rates and regularizer.
-        rng: random state of the order of the points.
         progress: show a bar on a terminal.
 
     Returns:
@@ -100,12 +98,12 @@ def fit_weights(
     factors = balance_classes(labels) if config.balance else torch.ones_like(labels)
     batch_size = config.batch_size or max(256, len(labels) // 128)
     plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
-    order = torch.randperm(len(labels), generator=rng, device=rng.device)
-    chunks = _Chunks(features_of, labels, factors, order, batch_size)
+    features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))
     state = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights))
     step = 0
     for _ in tqdm(range(config.passes), "weights", disable=None if progress else True):
-        for chunk in chunks:
+        for rows in features.chunks(len(labels)):
+            chunk = _Chunk(*features[rows], labels[rows], factors[rows])
             native_path = native.descends(chunk.indices, chunk.values)
             state = (_native_steps if native_path else _plain_steps)(chunk, state, step, plan)
             step += -(-len(chunk.labels) // batch_size)
@@ -128,34 +126,29 @@ class _Chunk(NamedTuple):
     factors: Tensor
 
 
-class _Chunks:
-    """The shuffled points, chunk by chunk, as often as asked."""
+class _Features:
+    """Features of chunks of rows; as many as fit are kept."""
 
-    def __init__(
-        self,
-        features_of: FeaturesOf,
-        labels: Tensor,
-        factors: Tensor,
-        order: Tensor,
-        batch_size: int,
-    ) -> None:
-        self.features_of, self.labels, self.factors = features_of, labels, factors
-        self.rows = order.split(batch_size * max(1, CHUNK_ROWS // batch_size))
-        self.kept: dict[int, _Chunk] = {}
+    def __init__(self, features_of: FeaturesOf, chunk_rows: int) -> None:
+        self.features_of, self.chunk_rows = features_of, chunk_rows
+        self.kept: dict[int, tuple[Tensor, Tensor]] = {}
         self.room = CACHE_BYTES
 
-    def __iter__(self) -> Iterator[_Chunk]:
-        """Every chunk once, in order."""
-        for number, rows in enumerate(self.rows):
-            yield self.kept[number] if number in self.kept else self._make(number, rows)
+    def chunks(self, num_rows: int) -> Iterator[slice]:
+        """Slices that cover all rows, in order."""
+        for start in range(0, num_rows, self.chunk_rows):
+            yield slice(start, min(num_rows, start + self.chunk_rows))
 
-    def _make(self, number: int, rows: Tensor) -> _Chunk:
-        chunk = _Chunk(*self.features_of(rows), self.labels[rows], self.factors[rows])
-        size = sum(tensor.numel() * tensor.element_size() for tensor in chunk)
+    def __getitem__(self, rows: slice) -> tuple[Tensor, Tensor]:
+        """Indices and kernel values (R, K) of one chunk."""
+        if rows.start in self.kept:
+            return self.kept[rows.start]
+        found = self.features_of(rows)
+        size = sum(tensor.numel() * tensor.element_size() for tensor in found)
         if size <= self.room:
-            self.kept[number] = chunk
+            self.kept[rows.start] = found
             self.room -= size
-        return chunk
+        return found
 
 
 def _plain_steps(chunk: _Chunk, state: State, step: int, plan: _Plan) -> State:

@@ -144,11 +144,7 @@ class LardHilbertMap(nn.Module):
                 f"points must be (..., {self.dim}), one row of coordinates per point; "
                 f"got {tuple(points.shape)}"
             )
-        # The origin is whole meters: exact in float32 too, so float32 points lose nothing.
-        working = torch.promote_types(
-            torch.promote_types(points.dtype, self.centers.dtype), torch.float32
-        )
-        return (points.to(working) - self.origin.to(working)).to(self.centers.dtype)
+        return to_frame(points, self.origin, self.centers.dtype)
 
     # --- how the map learns ---
 
@@ -190,8 +186,8 @@ class LardHilbertMap(nn.Module):
             raise ValueError(f"num_clusters must be 1 or more, or None; got {num_clusters}")
         dtype = self.centers.dtype
         rng = torch.Generator(device=points.device).manual_seed(seed)
-        origin = points.mean(dim=0).round()
-        local, labels = (points - origin).to(dtype), labels.to(dtype)
+        origin = points.mean(dim=0, dtype=torch.float64).round()
+        local, labels = to_frame(points, origin, dtype), labels.to(dtype)
         clusters, is_occupied = cluster_classes(local, labels, num_clusters, rng)
         learned = LardHilbertMap(**self.settings).to(self.centers)
         learned._grow(clusters, is_occupied, origin)
@@ -202,14 +198,15 @@ class LardHilbertMap(nn.Module):
     def _train_weights(
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
     ) -> None:
-        centers, raw_scale_tril = self.centers.detach(), self.raw_scale_tril.detach()
+        order = torch.randperm(len(local), generator=rng, device=rng.device)
+        local, labels = local[order], labels[order]
+        state = (self.centers.detach(), self.raw_scale_tril.detach(), self.kernel)
         index = self._fresh_index()
 
-        def features_of(rows: Tensor) -> tuple[Tensor, Tensor]:
-            return native.nearest_features(local[rows], centers, raw_scale_tril, self.kernel, index)
+        def features_of(rows: slice) -> tuple[Tensor, Tensor]:
+            return native.nearest_features(local[rows], *state, index)
 
-        start = self.weights.detach()
-        weights = fit_weights(features_of, labels, start, config, rng, progress)
+        weights = fit_weights(features_of, labels, self.weights.detach(), config, progress)
         with torch.no_grad():
             self.weights.copy_(weights)
 
@@ -277,11 +274,20 @@ class LardHilbertMap(nn.Module):
         return self
 
 
+def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
+    """(..., D) world positions -> positions relative to an origin of whole meters, of that dtype.
+
+    Whole meters are exact in float32 too, so float32 points lose nothing.
+    """
+    working = torch.promote_types(torch.promote_types(points.dtype, dtype), torch.float32)
+    return (points.to(working) - origin.to(working)).to(dtype)
+
+
 def check_samples(
     points: Tensor, labels: Tensor, dim: int, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Training pairs as (N, D) float64 points and (N,) labels, or a ValueError that says why not."""
-    points = torch.as_tensor(points, device=device).detach().to(torch.float64)
+    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not."""
+    points = torch.as_tensor(points, device=device).detach()
     labels = torch.as_tensor(labels, device=device).detach()
     if points.ndim != 2 or points.shape[1] != dim:
         raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")

@@ -32,10 +32,9 @@ def dense(indices, values, clusters):
 
 
 def fit(indices, values, labels, clusters, **settings):
-    config = FitConfig(**settings)
-    rng = torch.Generator().manual_seed(0)
     start = torch.zeros(clusters, dtype=F64)
-    return fit_weights(lambda r: (indices[r], values[r]), labels, start, config, rng)
+    features_of = lambda rows: (indices[rows], values[rows])  # noqa: E731
+    return fit_weights(features_of, labels, start, FitConfig(**settings))
 
 
 @pytest.mark.parametrize("balance", [True, False])
@@ -66,8 +65,7 @@ def test_the_papers_sgd_is_one_step_a_point_against_the_gradient():
     paper = {"passes": 1, "batch_size": 1, "learning_rate": 0.1, "decay": False}
     ours = fit(indices, values, labels, 4, **paper, preconditioner=False, l2=0, balance=False)
     weights = torch.zeros(4, dtype=F64)
-    order = torch.randperm(5, generator=torch.Generator().manual_seed(0))
-    for row in order:
+    for row in range(5):
         phi = dense(indices[row : row + 1], values[row : row + 1], 4)[0]
         weights = weights - 0.1 * (torch.sigmoid(phi @ weights) - labels[row]) * phi
     torch.testing.assert_close(ours, weights)
@@ -101,19 +99,12 @@ def test_both_classes_weigh_the_same_however_rare_one_is():
     assert torch.equal(balance_classes(torch.ones(4)), torch.ones(4))
 
 
-def test_the_start_is_left_alone_and_the_seed_decides():
+def test_the_start_is_left_alone():
     indices, values, labels = problem()
     start = torch.ones(12, dtype=F64)
-    runs = [
-        fit_weights(
-            lambda r: (indices[r], values[r]),
-            labels, start, FitConfig(), torch.Generator().manual_seed(seed),
-        )
-        for seed in (1, 1, 2)
-    ]  # fmt: skip
+    features_of = lambda rows: (indices[rows], values[rows])  # noqa: E731
+    assert not torch.equal(fit_weights(features_of, labels, start, FitConfig()), start)
     assert torch.equal(start, torch.ones(12, dtype=F64))
-    assert torch.equal(runs[0], runs[1])
-    assert not torch.equal(runs[0], runs[2])
 
 
 def test_features_are_computed_once_where_they_can_be_kept_and_anew_where_not(monkeypatch):
@@ -121,20 +112,20 @@ def test_features_are_computed_once_where_they_can_be_kept_and_anew_where_not(mo
     calls = []
 
     def features_of(rows):
-        calls.append(len(rows))
+        calls.append(rows.stop - rows.start)
         return indices[rows], values[rows]
 
     def fit_in_chunks():
         calls.clear()
-        start, rng = torch.zeros(12, dtype=F64), torch.Generator().manual_seed(0)
-        return fit_weights(features_of, labels, start, FitConfig(batch_size=50), rng)
+        start = torch.zeros(12, dtype=F64)
+        return fit_weights(features_of, labels, start, FitConfig(batch_size=50))
 
     whole = fit_in_chunks()
     assert calls == [600]
     monkeypatch.setattr(fitting, "CHUNK_ROWS", 120)  # two whole batches
     torch.testing.assert_close(fit_in_chunks(), whole)
     assert calls == [100] * 6
-    monkeypatch.setattr(fitting, "CACHE_BYTES", 3 * 100 * (3 * 8 + 3 * 8 + 8 + 8))
+    monkeypatch.setattr(fitting, "CACHE_BYTES", 3 * 100 * (3 * 8 + 3 * 8))
     torch.testing.assert_close(fit_in_chunks(), whole)
     assert calls == [100] * (3 + 3 * 4)
 
@@ -166,7 +157,7 @@ def test_the_fused_passes_equal_the_plain_ones(dtype, settings):
     fused, plain = (
         fit_weights(
             lambda rows, given=given: (given[rows], values[rows]),
-            labels, start, config, torch.Generator().manual_seed(0),
+            labels, start, config,
         )
         for given in (indices.int(), indices)
     )  # fmt: skip
@@ -180,9 +171,7 @@ def test_the_fused_pass_refuses_rows_that_are_not_there():
     indices, values, labels = problem()
     start, wrong = torch.zeros(12, dtype=F64), indices.int() + 5
     with pytest.raises(RuntimeError, match="index out of range"):
-        fit_weights(
-            lambda rows: (wrong[rows], values[rows]), labels, start, FitConfig(), torch.Generator()
-        )
+        fit_weights(lambda rows: (wrong[rows], values[rows]), labels, start, FitConfig())
 
 
 @pytest.mark.skipif(not native.available(), reason="the native kernel is not available")

@@ -22,8 +22,8 @@
 
 namespace lardhm {
 
-constexpr int64_t kMostPoints = 2048;  // in a region
-constexpr double kRegionPoints = 6000, kGroupPoints = 128, kSparse = 25;
+constexpr int64_t kMostPoints = 1024;  // in a region
+constexpr double kRegionPoints = 3000, kGroupPoints = 64, kSparse = 25;
 
 // How many sorted points share a list of blocks, a list of candidates, a register. The fewer points
 // there are a center, the more centers lie between neighbors: where they are very sparse, a point
