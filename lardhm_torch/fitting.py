@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import native
+from lardhm_torch.clustering import z_order
 
 CHUNK_ROWS = 1 << 20  # points whose features are computed at a time
 CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
@@ -36,6 +37,10 @@ class FitConfig:
     l1: float = 0.0  # lambda_2 of eq. (2), by soft thresholding: weights become exactly 0
     balance: bool = True  # each class counts for half of the loss, however few its points
 
+    def rows_a_batch(self, num_points: int) -> int:
+        """Points a step."""
+        return self.batch_size or max(256, num_points // 128)
+
     def __post_init__(self) -> None:
         if self.passes < 1:
             raise ValueError(f"passes must be 1 or more; got {self.passes}")
@@ -45,6 +50,24 @@ class FitConfig:
             raise ValueError(f"learning_rate must be > 0; got {self.learning_rate}")
         if self.l1 < 0 or self.l2 < 0:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
+
+
+def training_order(points: Tensor, batch_size: int, rng: torch.Generator) -> Tensor:
+    """(N, D) positions [m] -> (N,) rows in the order in which `fit_weights` should take them.
+
+    The points are sorted along a space-filling curve and dealt out to the batches in turn, each
+    round from another random batch on, and the batches are shuffled. So every batch is a sample of
+    all space, more even than a random one, and its neighbors in space lie next to each other in
+    memory.
+    """
+    batches = -(-len(points) // batch_size)
+    rounds = -(-len(points) // batches)
+    rows = torch.full((rounds * batches,), -1, dtype=torch.long, device=points.device)
+    rows[: len(points)] = z_order(points)
+    first = torch.randint(batches, (rounds, 1), generator=rng, device=rng.device)
+    turn = torch.randperm(batches, generator=rng, device=rng.device)
+    dealt = rows.reshape(rounds, batches).gather(1, (first + turn) % batches).T.reshape(-1)
+    return dealt[dealt >= 0]
 
 
 def balance_classes(labels: Tensor) -> Tensor:
@@ -79,13 +102,13 @@ def fit_weights(
 
     w <- w - eta_t A^-1 g, with g the gradient of a batch scaled to all points. The preconditioner
     A is the running root mean square of g, and g is smoothed over steps (Adam), so that weights of
-    rarely seen clusters learn as fast as others. Every pass takes the points in the order given, so
-    **shuffle them first**. Features are computed once and kept up to `CACHE_BYTES`, the others anew
-    in every pass.
+    rarely seen clusters learn as fast as others. Every pass takes the points in the order given:
+    bring them into that of `training_order` first. Features are computed once and kept up to
+    `CACHE_BYTES`, the others anew in every pass.
 
     Args:
         features_of: slice of B rows -> indices (B, K) and kernel values (B, K) of those points.
-        labels: (N,) 1 occupied, 0 free, in random order.
+        labels: (N,) 1 occupied, 0 free, in training order.
         weights: (M,) start, left as it is.
         config: passes, rates and regularizer.
         progress: show a bar on a terminal.
@@ -96,7 +119,7 @@ def fit_weights(
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
     factors = balance_classes(labels) if config.balance else torch.ones_like(labels)
-    batch_size = config.batch_size or max(256, len(labels) // 128)
+    batch_size = config.rows_a_batch(len(labels))
     plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))
     state = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights))

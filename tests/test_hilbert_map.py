@@ -323,3 +323,18 @@ def test_the_papers_own_sgd_is_available():
     points, labels = wall()
     model = LardHilbertMap().fit(points, labels, num_clusters=40, config=paper)
     assert ((model(points) > 0.5) == (labels > 0.5)).double().mean() > 0.9
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_a_lattice_gives_what_its_points_give(dim):
+    points = torch.randn(300, dim, generator=torch.Generator().manual_seed(0)) + 100
+    model = LardHilbertMap(dim=dim).fit(points, (points[:, 0] > 100).float(), num_clusters=12)
+    axes = [torch.linspace(97, 103, n, dtype=torch.float64) for n in (7, 11, 5)[:dim]]
+    lattice = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    torch.testing.assert_close(model.query_lattice(axes), model(lattice).detach())
+    log_odds = model.query_lattice(axes, probability=False)
+    torch.testing.assert_close(log_odds, model.log_odds(lattice).detach())
+    with pytest.raises(ValueError, match=f"axes must be {dim} lists"):
+        model.query_lattice([*axes, axes[0]])
+    with pytest.raises(ValueError, match="axes must be finite"):
+        model.query_lattice([axes[0] * torch.inf, *axes[1:]])

@@ -204,6 +204,30 @@ def test_order_and_number_of_points_do_not_change_a_bit(ops):
     assert torch.equal(torch.cat(chunks), whole)
 
 
+@dtypes
+@pytest.mark.parametrize("shape", [(7, 9), (40, 33), (1, 1, 1), (8, 8, 8), (13, 21, 6), (3, 0, 5)])
+@pytest.mark.parametrize("count", [0, 3, 400])
+def test_a_lattice_is_answered_as_its_points_are(ops, dtype, shape, count):
+    parameters = make_map(count, len(shape), dtype)
+    axes = [torch.linspace(-4, 3, n, dtype=dtype) for n in shape]
+    points = torch.cartesian_prod(*axes)
+    index = ops.build_index(parameters[0], 5)
+    for probability in (True, False):
+        expected = ops.occupancy(points, *parameters, *kernel(5), index, probability)
+        found = native.lattice_occupancy(
+            axes, *parameters, kernel(5), probability=probability, index=index
+        )
+        assert torch.equal(found, expected.reshape(shape))
+
+
+def test_lattices_of_other_dimensions_and_types_are_refused(ops):
+    parameters = make_map(9, 3, torch.float32)
+    index = ops.build_index(parameters[0], 5)
+    for axes, shape in ((torch.zeros(4), [2, 2]), (torch.zeros(5).double(), [2, 2, 1])):
+        with pytest.raises(RuntimeError, match="axes must hold one list of coordinates"):
+            ops.lattice_occupancy(axes, shape, *parameters, *kernel(5), index, True)
+
+
 def test_huge_coordinates_neither_hang_nor_spoil_other_points(ops):
     parameters = make_map(100, 3, torch.float32)
     points = torch.tensor([[1e19, 0, 0], [1e30, -1e30, 1e30], [0, 0, 0], [3e38, -3e38, 3e38]])
@@ -351,6 +375,8 @@ def test_opcheck_accepts_the_operators(ops):
     torch.library.opcheck(ops.build_index.default, (parameters[0], 5))
     given = (points, *parameters[:2], index)
     torch.library.opcheck(ops.nearest_features.default, (*given, *kernel(5)))
+    lattice = (points.flatten()[:9], [2, 3, 4], *parameters, *kernel(5), index, True)
+    torch.library.opcheck(ops.lattice_occupancy.default, lattice)
     rows = torch.arange(40).reshape(2, 20)
     torch.library.opcheck(ops.kmeans.default, (points, parameters[0], rows, 20, 5))
     torch.library.opcheck(ops.z_order.default, (points,))

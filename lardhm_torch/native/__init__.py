@@ -7,6 +7,7 @@ makes its own otherwise, so a stale index costs time and never an answer.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -87,6 +88,35 @@ def occupancy(
     )
 
 
+def lattice_occupancy(
+    axes: list[Tensor],
+    centers: Tensor,
+    raw_scale_tril: Tensor,
+    weights: Tensor,
+    kernel: Kernel,
+    *,
+    probability: bool,
+    index: Tensor,
+) -> Tensor:
+    """As `occupancy` of all points of a lattice, without gradients, in the shape of the lattice.
+
+    ``axes`` are D lists of finite coordinates [m]; all their combinations are the points.
+    """
+    shape = [len(axis) for axis in axes]
+    parameters = (centers.detach(), raw_scale_tril.detach(), weights.detach())
+    if supports(centers):
+        return torch.ops.lardhm.lattice_occupancy(
+            torch.cat(axes), shape, *parameters, *kernel, index, probability
+        )
+    slabs = []
+    for slab in axes[0].split(max(1, features.QUERY_CHUNK // max(1, math.prod(shape[1:])))):
+        lattice = torch.meshgrid(slab, *axes[1:], indexing="ij")
+        points = torch.stack(lattice, dim=-1).reshape(-1, len(axes))
+        answer = occupancy(points, *parameters, kernel, probability=probability, index=index)
+        slabs.append(answer.reshape(len(slab), *shape[1:]))
+    return torch.cat(slabs)
+
+
 def nearest_features(
     points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -161,6 +191,10 @@ def _register() -> None:
     @library.register_fake("lardhm::occupancy")
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0])
+
+    @library.register_fake("lardhm::lattice_occupancy")
+    def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:
+        return axes.new_empty(shape)
 
     @library.register_fake("lardhm::occupancy_backward")
     def _(grad: Tensor, points: Tensor, centers: Tensor, raw: Tensor, weights: Tensor,

@@ -59,6 +59,11 @@ struct Scratch {
   int64_t room = 0;
   Selection selected;
 
+  void make_room() {
+    order.resize(kMostPoints);
+    for (int d = 0; d < D; ++d) x[d].resize(kMostPoints + Simd<T>::W);
+  }
+
   void reserve_list(int64_t n) {
     if (n <= room) return;
     room = 2 * n;
@@ -222,20 +227,34 @@ struct Engine {
   // by one where a coordinate is not finite.
   void visit(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor<T, D>& visitor) const {
     const int64_t n = sort_points(begin, end, s, visitor);
-    s.order.resize(kMostPoints);
-    for (int d = 0; d < D; ++d) s.x[d].resize(kMostPoints + W);
+    s.make_room();
     s.sharing = Sharing(n, index.header.count, W);
     for (int64_t i = 0, stop; i < n; i = stop) {
       stop = cut(s.sorter.items, n, i, std::min(n, i + s.sharing.region));
       gather(begin, i, stop, s);
-      s.region = region_of(s, 0, stop - i);
-      s.far_radius = -1;
-      for (int64_t j = i, end; j < stop; j = end) {
-        end = cut(s.sorter.items, n, j, std::min(stop, j + s.sharing.group));
-        s.group = region_of(s, j - i, end - i);
-        s.near_radius = -1;
-        visit_group(begin, n, i, j, end, s, visitor);
-      }
+      visit_region(begin, n, i, stop, s, visitor);
+    }
+  }
+
+  // The n points in s.x, neighbors after each other already, for a lattice of `total` points; a
+  // point's row is `begin` and its s.order.
+  void visit_filled(int64_t begin, int64_t n, int64_t total, Scratch<T, D>& s,
+                    Visitor<T, D>& visitor) const {
+    s.sharing = Sharing(total, index.header.count, W);
+    s.sorter.items.assign(n, 0);  // one cell of the Z curve: nothing to cut at
+    visit_region(begin, n, 0, n, s, visitor);
+  }
+
+  // The sorted points first .. stop, whose coordinates are in s.x.
+  void visit_region(int64_t begin, int64_t n, int64_t first, int64_t stop, Scratch<T, D>& s,
+                    Visitor<T, D>& visitor) const {
+    s.region = region_of(s, 0, stop - first);
+    s.far_radius = -1;
+    for (int64_t j = first, end; j < stop; j = end) {
+      end = cut(s.sorter.items, n, j, std::min(stop, j + s.sharing.group));
+      s.group = region_of(s, j - first, end - first);
+      s.near_radius = -1;
+      visit_group(begin, n, first, j, end, s, visitor);
     }
   }
 

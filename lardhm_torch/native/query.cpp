@@ -203,6 +203,39 @@ Tensor occupancy(const Tensor& given_points, const Tensor& centers, const Tensor
   return values;
 }
 
+// The same for a lattice; `axes` holds the coordinates of all axes after each other.
+Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyArrayRef shape,
+                         const Tensor& centers, const Tensor& raw, const Tensor& weights, int64_t k,
+                         double covariance_scale, double min_lengthscale, const Tensor& index,
+                         bool probability) {
+  check_k(k);
+  const Tensor axes = tidy(given_axes);
+  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  int64_t coordinates = 0, total = 1, near = 1;
+  for (int64_t n : shape) coordinates += n, total *= n;
+  for (size_t d = 1; d < shape.size(); ++d) near *= shape[d];
+  STD_TORCH_CHECK(int64_t(shape.size()) == centers.size(1) && axes.numel() == coordinates &&
+                      axes.scalar_type() == centers.scalar_type() && near < (int64_t(1) << 26),
+                  "axes must hold one list of coordinates for each dimension of the map, of its "
+                  "dtype, and fewer than 2^26 points in a plane");
+  k = std::min(k, centers.size(0));
+  const Tensor values = torch::stable::new_zeros(axes, shape);
+  if (total == 0 || k == 0) return probability ? torch::stable::fill_(values, 0.5) : values;
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const T* axis[D];
+    for (int d = 0; d < D; ++d) axis[d] = d ? axis[d - 1] + shape[d - 1] : in<T>(axes);
+    with_parameters<T, D>(map, total, [&](Parameters<T, D>& parameters) {
+      visit_lattice<T, D>(axis, shape.data(), parameters, k, [&](int64_t) {
+        return std::make_unique<OccupancyVisitor<T, D>>(parameters, probability, out<T>(values));
+      });
+    });
+    return 0;
+  });
+  return values;
+}
+
 }  // namespace
 }  // namespace lardhm
 
@@ -216,6 +249,10 @@ STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
   m.def(
       "occupancy(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor weights, int k, "
       "float covariance_scale, float min_lengthscale, Tensor index, bool probability) -> Tensor");
+  m.def(
+      "lattice_occupancy(Tensor axes, int[] shape, Tensor centers, Tensor raw_scale_tril, "
+      "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
+      "bool probability) -> Tensor");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
@@ -224,4 +261,5 @@ STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
   m.impl("nearest", TORCH_BOX(&lardhm::nearest));
   m.impl("nearest_features", TORCH_BOX(&lardhm::nearest_features));
   m.impl("occupancy", TORCH_BOX(&lardhm::occupancy));
+  m.impl("lattice_occupancy", TORCH_BOX(&lardhm::lattice_occupancy));
 }

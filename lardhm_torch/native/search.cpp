@@ -1,8 +1,10 @@
 // Running visitors over all points, on all threads.
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <cstdint>
+#include <vector>
 
 #include "engine.h"
 
@@ -71,11 +73,109 @@ void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64
   });
 }
 
+namespace {
+
+// Bricks of a lattice: cubes of kBrick points an edge, in cubes of 4, in runs of packets.
+template <int D>
+constexpr int kBrick = D == 3 ? 8 : 32;
+
+template <int D>
+struct Lattice {
+  int64_t shape[D], bricks[D], total = 1, tasks = 1;
+
+  explicit Lattice(const int64_t* shape_) {
+    for (int d = 0; d < D; ++d) {
+      shape[d] = shape_[d];
+      bricks[d] = (shape[d] + kBrick<D> - 1) / kBrick<D>;
+      total *= shape[d];
+      tasks *= bricks[d];
+    }
+  }
+
+  // First point of a brick, and how many it has along each axis.
+  void corner(int64_t brick, int64_t* first, int* edge) const {
+    for (int d = D - 1; d >= 0; --d) {
+      first[d] = brick % bricks[d] * kBrick<D>;
+      edge[d] = int(std::min<int64_t>(kBrick<D>, shape[d] - first[d]));
+      brick /= bricks[d];
+    }
+  }
+
+  int64_t row(const int64_t* at) const {
+    int64_t row = 0;
+    for (int d = 0; d < D; ++d) row = row * shape[d] + at[d];
+    return row;
+  }
+};
+
+// Steps from the corner of a brick along each axis, along a Z curve.
+template <int D>
+std::vector<std::array<int8_t, D>> brick_order() {
+  std::vector<std::array<int8_t, D>> order;
+  int count = 1;
+  for (int d = 0; d < D; ++d) count *= kBrick<D>;
+  for (int code = 0; code < count; ++code) {
+    std::array<int8_t, D> step{};
+    for (int bit = 0; (1 << bit) < count; ++bit)
+      step[D - 1 - bit % D] |= int8_t((code >> bit & 1) << bit / D);
+    order.push_back(step);
+  }
+  return order;
+}
+
+// Puts a brick's points into the scratch; returns how many there are.
+template <class T, int D>
+int64_t fill_brick(const T* const* axes, const Lattice<D>& lattice, const int64_t* first,
+                   const int* edge, const std::vector<std::array<int8_t, D>>& order,
+                   Scratch<T, D>& s) {
+  int64_t n = 0;
+  for (const auto& step : order) {
+    int64_t offset = 0;
+    bool inside = true;
+    for (int d = 0; d < D; ++d) {
+      inside &= step[d] < edge[d];
+      offset = offset * lattice.shape[d] + step[d];
+    }
+    if (!inside) continue;
+    for (int d = 0; d < D; ++d) s.x[d][n] = axes[d][first[d] + step[d]];
+    s.order[n++] = int32_t(offset);
+  }
+  return n;
+}
+
+}  // namespace
+
+template <class T, int D>
+void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>& parameters,
+                   int64_t k, const MakeVisitor<T, D>& make) {
+  const Lattice<D> lattice(shape);
+  const Engine<T, D> engine(nullptr, parameters, k);
+  const auto order = brick_order<D>();
+  const int64_t threads = parameters.packed.empty() ? num_threads() : 1;
+  std::atomic<int64_t> next{0};
+  run_tasks(std::min(lattice.tasks, threads), [&](int64_t worker) {
+    constexpr int64_t kRun = 16;  // bricks taken at a time
+    Scratch<T, D> scratch;
+    scratch.make_room();
+    const auto visitor = make(worker);
+    for (int64_t begin = kRun * next++; begin < lattice.tasks; begin = kRun * next++)
+      for (int64_t brick = begin; brick < std::min(lattice.tasks, begin + kRun); ++brick) {
+        int64_t first[D];
+        int edge[D];
+        lattice.corner(brick, first, edge);
+        const int64_t n = fill_brick<T, D>(axes, lattice, first, edge, order, scratch);
+        engine.visit_filled(lattice.row(first), n, lattice.total, scratch, *visitor);
+      }
+  });
+}
+
 #define LARDHM_INSTANTIATE(T, D)                                                                 \
   template void visit_all<T, D>(const T*, int64_t, Parameters<T, D>&, int64_t,                   \
                                 const MakeVisitor<T, D>&);                                       \
   template void visit_parts<T, D>(const T*, int64_t, Parameters<T, D>&, int64_t, int64_t,        \
-                                  const MakeVisitor<T, D>&);
+                                  const MakeVisitor<T, D>&);                                     \
+  template void visit_lattice<T, D>(const T* const*, const int64_t*, Parameters<T, D>&, int64_t, \
+                                    const MakeVisitor<T, D>&);
 LARDHM_INSTANTIATE(float, 2)
 LARDHM_INSTANTIATE(float, 3)
 LARDHM_INSTANTIATE(double, 2)

@@ -33,6 +33,12 @@ template <class T, int D>
 void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k, int64_t parts,
                  const MakeVisitor<T, D>& make);
 
+// Shows all points of a lattice, the D lists of coordinates in `axes` (shape[d] finite ones each, the
+// last axis fastest), brick by brick: there is nothing to sort, and no point is ever stored.
+template <class T, int D>
+void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>& parameters,
+                   int64_t k, const MakeVisitor<T, D>& make);
+
 // How many parts to sum in: one a thread, fewer where the sums outweigh the work.
 template <class T, int D>
 int64_t parts_of(int64_t n, int64_t bytes_of_sums, const Parameters<T, D>& parameters) {
