@@ -1,6 +1,9 @@
 from pathlib import Path
 
 import pytest
+import torch
+
+from lardhm_torch import native
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -11,3 +14,11 @@ def data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"real scans are not at {DATA}")
     return DATA
+
+
+@pytest.fixture
+def ops():
+    """The native operators; the test is skipped where they cannot be built."""
+    if not native.available():
+        pytest.skip("the native kernel is off or there is no compiler")
+    return torch.ops.lardhm
