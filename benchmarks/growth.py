@@ -18,6 +18,7 @@ from workers import peak_memory
 
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays
 
+FIXED, DENSE = "500,000 points", "40 points a cluster"
 CANDIDATES = 26  # centers a point is compared with, of the floor's count of operations
 Result = dict[str, Any]
 
@@ -26,26 +27,24 @@ Result = dict[str, Any]
 
 
 def growth_clusters(arguments: argparse.Namespace) -> Result:
-    """Query time a point as the map grows from 500 to 200,000 clusters, random order."""
-    count = 500_000
+    """Query time a point as the map grows from 500 to 200,000 clusters, random order.
+
+    Once with as many points for every map, and once with as many points a cluster.
+    """
     rows: list[dict[str, Any]] = []
     for num_clusters in (500, 5_000, 50_000, 200_000):
-        model, points = made_up_map(num_clusters), queries(num_clusters, count)
-        first = time_once(partial(model, points[:1]))
-        ask = Contender("query", partial(model, points))
-        timed = compare("query", [ask], arguments.repeats, count)["rows"][0]
+        model = made_up_map(num_clusters)
+        first = time_once(partial(model, queries(num_clusters, 1)))
         size = sum(t.numel() * t.element_size() for t in (*model.parameters(), *model.buffers()))
-        rows.append(
-            {
-                "clusters": num_clusters,
-                "ns a point": timed["item_ns"],
-                "ratio to smallest": timed["item_ns"] / rows[0]["ns a point"] if rows else 1.0,
-                "first query ms (index)": 1e3 * first,
-                "bytes a cluster": size / num_clusters,
-            }
-        )
-    notes = [f"{count:,} points, k = {NUM_NEIGHBORS}; clusters cover more ground, equally dense"]
-    return {"title": "Growth with clusters", "rows": rows, "notes": notes}
+        row: dict[str, Any] = {"clusters": num_clusters}
+        for name, count in ((FIXED, 500_000), (DENSE, 40 * num_clusters)):
+            ask = Contender("query", partial(model, queries(num_clusters, count)))
+            timed = compare("query", [ask], arguments.repeats, count)["rows"][0]
+            row[name] = timed["item_ns"]
+            row[f"{name}, ratio"] = row[name] / rows[0][name] if rows else 1.0
+        rows.append(row | {"first query ms": 1e3 * first, "bytes a cluster": size / num_clusters})
+    notes = [f"k = {NUM_NEIGHBORS}; clusters cover more ground, equally dense"]
+    return {"title": "Growth with clusters: ns a point", "rows": rows, "notes": notes}
 
 
 def growth_points(arguments: argparse.Namespace) -> Result:

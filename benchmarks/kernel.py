@@ -9,6 +9,7 @@ The floor is what any method pays: reading the points and writing the answers on
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -68,8 +69,9 @@ def measure(points: Tensor, centers: Tensor, repeats: int, threads: int) -> dict
     ops = torch.ops.lardhm
     count = len(centers)
     spacing = (float(np.prod(ROOM)) / count) ** (1 / 3)
-    scale_tril = (0.4 * spacing * torch.eye(3)).expand(count, 3, 3).contiguous()
-    parameters = (centers, scale_tril, torch.randn(count), NUM_NEIGHBORS)
+    raw = (math.log(0.4 * spacing) * torch.eye(3)).expand(count, 3, 3).contiguous()
+    kernel = native.Kernel(NUM_NEIGHBORS)
+    parameters = (centers, raw, torch.randn(count), *kernel)
     index = ops.build_index(centers, NUM_NEIGHBORS)
     mixed = points[torch.randperm(len(points))]
     batch, grad = mixed[:BATCH], torch.randn(BATCH)
@@ -81,6 +83,9 @@ def measure(points: Tensor, centers: Tensor, repeats: int, threads: int) -> dict
         "clusters": count,
         "lattice": each(lambda: ops.occupancy(points, *parameters, index, True), len(points)),
         "random": each(lambda: ops.occupancy(mixed, *parameters, index, True), len(points)),
+        "features": each(
+            lambda: ops.nearest_features(mixed, centers, raw, index, *kernel), len(points)
+        ),
         "nearest": each(lambda: ops.nearest(batch, centers, NUM_NEIGHBORS, index), BATCH),
         "assign": each(lambda: ops.assign(batch, centers, index, True), BATCH),
         "backward": each(

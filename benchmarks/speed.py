@@ -34,10 +34,9 @@ from table_two import (
 from timing import Contender, compare, format_comparison, format_rows
 from workers import plain_path
 
-from lardhm_torch import FitConfig, LardHilbertMap
-from lardhm_torch.clustering import cluster_moments, factor_covariances, mini_batch_kmeans
-from lardhm_torch.fitting import fit_weights
-from lardhm_torch.native import nearest_centers
+from lardhm_torch import FitConfig, LardHilbertMap, native
+from lardhm_torch.clustering import clusters_about, factor_covariances, mini_batch_kmeans
+from lardhm_torch.fitting import fit_weights, training_order
 
 # Table I and II of the paper [ms]: 8 cores of 2.5 GHz, 500 clusters.
 PAPER_STAGES = {
@@ -85,6 +84,7 @@ def query(arguments: argparse.Namespace) -> Result:
         contenders = [
             Contender("LARD-HM, lattice order", lambda: model(task.grid)),
             Contender("LARD-HM, random order", lambda: model(task.shuffled)),
+            Contender("LARD-HM, query_lattice", lambda: model.query_lattice(task.axes)),
             Contender("plain torch path, lattice order", partial(plain, "lattice")),
             Contender("plain torch path, random order", partial(plain, "random")),
             Contender("SciPy k-d tree + torch, lattice", lambda: libraries.query(task.grid)),
@@ -166,24 +166,28 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
 
     def lengthscales() -> None:
         for points, means in zip(classes, centers, strict=True):
-            nearest = nearest_centers(points, means, 1).squeeze(1)
-            clusters = cluster_moments(points, nearest, half)
+            clusters = clusters_about(means, *native.assign(points, means)[1:])
             factor_covariances(clusters.covariances, model.min_lengthscale)
 
-    features = model.features(task.points)
-    indices = features.indices()[1].reshape(len(task.points), -1)
-    values = features.values().reshape(len(task.points), -1)
+    config, rng = FitConfig(), torch.Generator().manual_seed(0)
+    order = training_order(task.points, config.rows_a_batch(len(task.points)), rng)
+    local, labels = (task.points - model.origin.float())[order], task.labels[order]
+    state = (model.centers, model.raw_scale_tril, model.kernel)
+    index = native.build_index(model.centers, model.num_neighbors)
+
+    def features() -> tuple[torch.Tensor, torch.Tensor]:
+        return native.nearest_features(local, *state, index)
+
+    kept = features()
 
     def weights() -> torch.Tensor:
-        rng = torch.Generator().manual_seed(0)
         start = torch.zeros(len(model))
-        kept = lambda rows: (indices[rows], values[rows])  # noqa: E731
-        return fit_weights(kept, task.labels, start, FitConfig(), rng)
+        return fit_weights(lambda rows: (kept[0][rows], kept[1][rows]), labels, start, config)
 
     return {
         "k-means": kmeans,
         "length-scales": lengthscales,
-        "training features": lambda: model.features(task.points),
+        "training features": features,
         "weights": weights,
         "grid features": lambda: model.features(task.grid),
         "grid query": lambda: model(task.grid),

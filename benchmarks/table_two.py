@@ -22,12 +22,13 @@ ONE_FREE_POINT = SamplingConfig(min_range=0.0, free_spacing=1e3, near_samples=0)
 
 
 class Task(NamedTuple):
-    """What is timed, in memory: (N, 3) points [m], (N,) labels, (Q, 3) grid, the rays themselves."""
+    """What is timed, in memory: (N, 3) points [m], (N,) labels, (Q, 3) grid, its axes, the rays."""
 
     points: Tensor
     labels: Tensor
     grid: Tensor
     shuffled: Tensor
+    axes: list[Tensor]
     scans: Scans
 
 
@@ -41,10 +42,11 @@ def load_task(folder: Path) -> Task:
         axes = [
             low + arrays["grid_step"] * np.arange(n) for low, n in zip(lower, shape, strict=True)
         ]
-    grid = torch.cartesian_prod(*(torch.as_tensor(axis) for axis in axes)).float()
+    axes = [torch.as_tensor(axis) for axis in axes]
+    grid = torch.cartesian_prod(*axes).float()
     assert (len(samples), len(grid)) == (NUM_POINTS, NUM_QUERIES)
     order = torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))
-    return Task(samples.points.float(), samples.labels.float(), grid, grid[order], scans)
+    return Task(samples.points.float(), samples.labels.float(), grid, grid[order], axes, scans)
 
 
 def fit_map(task: Task) -> LardHilbertMap:
