@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +82,7 @@ def query(arguments: argparse.Namespace) -> None:
     import torch
 
     from lardhm_torch import LardHilbertMap
+    from lardhm_torch.files import replaced_file
     from lardhm_torch.io import load_points
 
     model = LardHilbertMap.load(arguments.map)
@@ -92,7 +91,8 @@ def query(arguments: argparse.Namespace) -> None:
         points = points[:, :-1]  # flat scans, as `fit --dim 2` takes them
     with torch.no_grad():
         probability = model(points).float().numpy()
-    _write_atomically(arguments.output, lambda file: np.save(file, probability))
+    with replaced_file(arguments.output) as partial, open(partial, "wb") as file:
+        np.save(file, probability)
     print(f"{len(probability)} probabilities -> {arguments.output}")
 
 
@@ -167,19 +167,6 @@ def _report_dropped(dropped: dict[str, int]) -> None:
     for reason, count in dropped.items():
         if count:
             print(f"{count} rays {reason}", file=sys.stderr)
-
-
-def _write_atomically(path: str, write: Any) -> None:
-    target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.features import nearest_centers
+from lardhm_torch.files import replaced_file
 from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, cluster_boxes, grid_axes
 
 if TYPE_CHECKING:
@@ -100,17 +100,14 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
 
     Raises:
         ValueError: the extension is not one of .glb, .obj, .off, .ply, .stl.
+        FileNotFoundError: the folder of path does not exist.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
         known = ", ".join(MESH_SUFFIXES)
         raise ValueError(f"path must end in one of {known} for a mesh; got {path.name!r}")
-    partial = path.with_name(f".{path.name}.partial{path.suffix}")
-    try:
+    with replaced_file(path) as partial:
         mesh.export(partial, file_type=path.suffix[1:].lower())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _check_meshing(
