@@ -84,12 +84,12 @@ def test_several_paths_are_read_in_the_order_given(tmp_path):
 def test_paths_that_lead_to_no_scan_are_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"there is no .*missing\.ply"):
         load_scans(tmp_path / "missing.ply")
-    with pytest.raises(ValueError, match=r"at least one scan \(\.bin .*\.xyz\).* has none"):
+    with pytest.raises(ValueError, match=r"at least one scan \(\.bag .*\.xyz\).* has none"):
         load_scans(tmp_path)
     with pytest.raises(ValueError, match="at least one file or folder; got an empty list"):
         load_scans([])
     (tmp_path / "scan.docx").write_text("1 2 3")
-    with pytest.raises(ValueError, match=r"end in one of \.bin .*\.xyz; got .*scan\.docx"):
+    with pytest.raises(ValueError, match=r"end in one of \.bag .*\.xyz; got .*scan\.docx"):
         load_scans(tmp_path / "scan.docx")
 
 
