@@ -83,7 +83,7 @@ def extract_mesh(
             upper.amax(dim=0) + resolution,
         )  # whole cells cover the boxes
     cells = ((end - corner) / resolution + 1e-6).floor().long().clamp(min=1)
-    blocks = _active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
+    blocks = active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
     vertices, faces = _march_blocks(model, corner, resolution, blocks, cells, level, progress)
     world = vertices * resolution + corner.numpy()
     nearest = _nearest_supporters(model, supporters, world)
@@ -129,7 +129,7 @@ def _check_meshing(
         raise ValueError(f"evidence must be >= 0, or None to keep all faces; got {evidence}")
 
 
-def _active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
+def active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
     """(B, 3) numbers of the blocks that some box touches, ascending; boxes in cells from the corner."""
     last_block = (cells - 1) // BLOCK_CELLS
     first = (lower / BLOCK_CELLS).floor().long().clamp(min=0).minimum(last_block)
