@@ -1,8 +1,12 @@
 """Broken files of every format: a clear error that names the file."""
 
+import subprocess
+import sys
 import tracemalloc
+from pathlib import Path
 
 import pytest
+from fuzz_readers import available_formats
 from scan_files import CUT, LAS, some_points, whole_file, write_by_hand
 
 from lardhm_torch import io
@@ -19,6 +23,20 @@ def test_a_file_cut_anywhere_is_an_error_that_names_it(tmp_path, name):
         path.write_bytes(content[:cut])
         with pytest.raises(ValueError, match=r"scan\.\w+ cannot be read: \w"):
             load_points(path)
+
+
+NATIVE = [name for name in available_formats() if name[:3] in ("las", "laz", "e57")]
+PYTHON = [name for name in available_formats() if name not in NATIVE]
+
+
+@pytest.mark.parametrize("names", [PYTHON, NATIVE], ids=["python", "native"])
+def test_a_hundred_broken_files_of_each_format_neither_crash_nor_hang(names):
+    """In a process with a limit on memory, so that a crash of a library is seen (`make soak`)."""
+    script = Path(__file__).parents[1] / "scripts/fuzz_readers.py"
+    command = [sys.executable, script, *names, "--here", "--mutations", "100"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert len(run.stdout.splitlines()) == len(names)
 
 
 @pytest.mark.parametrize(

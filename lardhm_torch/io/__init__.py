@@ -39,9 +39,10 @@ from lardhm_torch.io.frames import placed
 from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import read_las
 from lardhm_torch.io.numpy_files import read_npy, read_npz, read_npz_points, write_npz
-from lardhm_torch.io.paths import expand_paths
+from lardhm_torch.io.paths import POSE_FILES, expand_paths
 from lardhm_torch.io.pcd import read_pcd
 from lardhm_torch.io.ply import read_ply
+from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.rgbd import Camera, is_rgbd_folder, read_rgbd
 from lardhm_torch.io.text import read_text
@@ -193,9 +194,11 @@ def _scans_from(readout: Readout, file: Path, origin: Sequence[float] | None) ->
             )
         origins = torch.tensor([tuple(origin)] * readout.num_scans, dtype=torch.float64).numpy()
     if origins is None:
+        poses = find_beside(file, POSE_FILES)
+        hint = "" if poses is None else f' For {poses.name}: frame="sensor" or frame="world".'
         raise ValueError(
             f"{file} must say where the sensor stood, and it does not. {readout.origin_cure} or "
-            "give it: load_scans(path, origin=(x, y, z)), --origin on the command line."
+            f"give it: load_scans(path, origin=(x, y, z)), --origin on the command line.{hint}"
         )
     columns = {
         "origins": origins,

@@ -53,7 +53,7 @@ class _PoseTopic:
 @dataclass
 class _Bag:
     kinds: dict[str, str] = field(default_factory=dict)  # of each topic
-    clouds: list[_Cloud] = field(default_factory=list)
+    clouds: dict[str, list[_Cloud]] = field(default_factory=dict)
     poses: dict[str, _PoseTopic] = field(default_factory=dict)
     tree: TransformTree = field(default_factory=TransformTree)
 
@@ -89,7 +89,8 @@ def read_bag(path: Path, topics: Sequence[str] = ()) -> Readout:
     cloud_topics = _topics_of(bag, [CLOUD], topics)
     if len(cloud_topics) != 1:
         raise ValueError(_topic_error("PointCloud2", cloud_topics, bag))
-    poses, gaps = _world_from_clouds(bag, topics)
+    clouds = bag.clouds[cloud_topics[0]]
+    poses, gaps = _world_from_clouds(bag, clouds, topics)
     placed = np.flatnonzero(gaps <= MAX_STAMP_GAP)
     if not len(placed):
         raise ValueError(
@@ -102,7 +103,7 @@ def read_bag(path: Path, topics: Sequence[str] = ()) -> Readout:
             f"{MAX_STAMP_GAP} s from any pose and are left out",
             stacklevel=2,
         )
-    ends = [move_points(poses[i, 0], bag.clouds[i].points) for i in placed]
+    ends = [move_points(poses[i, 0], clouds[i].points) for i in placed]
     if not any(map(len, ends)):
         raise ValueError("at least one point is needed; got none")
     return Readout(
@@ -146,9 +147,8 @@ def _take_in(bag: _Bag, message: Message, topics: Sequence[str], decode: Any) ->
         known.rows.append(pose_row(pose))
     elif kind == CLOUD and _topics_of(bag, [CLOUD], topics) == [topic]:
         cloud = decode(message)
-        bag.clouds.append(
-            _Cloud(*stamp_and_frame(cloud.header, message.stamp), cloud_points(cloud))
-        )
+        clouds = bag.clouds.setdefault(topic, [])
+        clouds.append(_Cloud(*stamp_and_frame(cloud.header, message.stamp), cloud_points(cloud)))
 
 
 def _topics_of(bag: _Bag, kinds: Iterable[str], topics: Sequence[str]) -> list[str]:
@@ -168,13 +168,14 @@ def _topic_error(what: str, found: list[str], bag: _Bag) -> str:
 
 
 def _world_from_clouds(
-    bag: _Bag, topics: Sequence[str]
+    bag: _Bag, clouds: list[_Cloud], topics: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(n, 2, 4, 4): what moves each cloud's points, and where its sensor stood; (n,) gaps [s]."""
-    frame = bag.clouds[0].frame if bag.clouds else ""
-    if not bag.clouds or any(cloud.frame != frame for cloud in bag.clouds):
-        raise ValueError("all clouds of a topic must be in one frame, and there must be one")
-    stamps = np.array([cloud.stamp for cloud in bag.clouds])
+    frame = clouds[0].frame
+    others = sorted({cloud.frame for cloud in clouds} - {frame})
+    if others:
+        raise ValueError(f"all clouds must be in one frame; got {frame}, {', '.join(others)}")
+    stamps = np.array([cloud.stamp for cloud in clouds])
     pose_topics = _topics_of(bag, POSE_OF, topics)
     if bag.tree.moves(frame) and not any(topic in topics for topic in pose_topics):
         poses, gaps = bag.tree.root_from(frame, stamps)
