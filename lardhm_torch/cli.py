@@ -99,7 +99,7 @@ def query(arguments: argparse.Namespace) -> None:
 def mesh(arguments: argparse.Namespace) -> None:
     """A map to a surface."""
     from lardhm_torch import LardHilbertMap, extract_mesh
-    from lardhm_torch.meshing import save_mesh
+    from lardhm_torch.mesh_files import save_mesh
 
     surface = extract_mesh(
         LardHilbertMap.load(arguments.map),

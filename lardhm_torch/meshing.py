@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.features import nearest_centers
-from lardhm_torch.files import replaced_file
 from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, cluster_boxes, grid_axes
 
 if TYPE_CHECKING:
@@ -22,7 +20,6 @@ BLOCK_CELLS = 24  # cells along a block's edge
 CHUNK_VERTICES = 1 << 18  # vertices probed at a time
 PROBES = (1.0, 2.0, 3.0)  # standard deviations before and behind a face where evidence is sought
 COLORS = ("height", "cluster", "probability")
-MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 
 
 def extract_mesh(
@@ -93,21 +90,6 @@ def extract_mesh(
         mesh.update_faces(seen[faces].all(axis=1))
     mesh.remove_unreferenced_vertices()
     return mesh
-
-
-def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
-    """Write a mesh, its format chosen by the extension; an existing file is replaced at the end.
-
-    Raises:
-        ValueError: the extension is not one of .glb, .obj, .off, .ply, .stl.
-        FileNotFoundError: the folder of path does not exist.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        known = ", ".join(MESH_SUFFIXES)
-        raise ValueError(f"path must end in one of {known} for a mesh; got {path.name!r}")
-    with replaced_file(path) as partial:
-        mesh.export(partial, file_type=path.suffix[1:].lower())
 
 
 def _check_meshing(
