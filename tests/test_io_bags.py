@@ -168,9 +168,35 @@ def test_of_several_topics_one_must_be_named(tmp_path, name):
         assert scans.origins.tolist() == [[0, 0, 0]]
 
 
+def test_a_name_that_no_topic_has_is_an_error(tmp_path):
+    path = write_bag(
+        tmp_path / "a.bag", lambda maker: bag_messages(maker, [some_points()], MOUNT[None])
+    )
+    with pytest.raises(ValueError, match=r"a topic of the name /typo is needed; got /odom \(nav"):
+        load_scans(path, topic="/typo")
+
+
+def test_tf_that_stands_still_gives_way_to_a_pose_topic(tmp_path):
+    """ROS 1 says a fixed mount again and again on /tf."""
+    points, poses = some_points(), turning_poses(2)
+
+    def messages(maker, has_odometry):
+        for number, pose in enumerate(poses):
+            yield maker.transform(MOUNT, 5.0 + number, ("base", "lidar"))
+            if has_odometry:
+                yield maker.odometry(pose, 5.0 + number, child="base")
+            yield maker.cloud(to_sensor(points, pose @ MOUNT), 5.0 + number)
+
+    scans = load_scans(write_bag(tmp_path / "a.bag", lambda maker: messages(maker, True)))
+    assert np.allclose(scans.ends, np.tile(points, (2, 1)), atol=1e-5)
+    scans = load_scans(write_bag(tmp_path / "b.bag", lambda maker: messages(maker, False)))
+    assert np.allclose(scans.origins, MOUNT[:3, 3])  # a scanner on its tripod
+
+
 def test_a_named_pose_topic_goes_before_tf(tmp_path):
     def messages(maker):
-        yield maker.transform(turning_poses(2)[1], 1.0, ("odom", "lidar"))
+        for stamp, pose in zip((0.0, 1.0), turning_poses(2), strict=True):
+            yield maker.transform(pose, stamp, ("odom", "lidar"))
         yield maker.pose(np.eye(4), 1.0)
         yield maker.cloud(some_points(), 1.0)
 

@@ -66,12 +66,13 @@ def is_bag_folder(folder: Path) -> bool:
 def read_bag(path: Path, topics: Sequence[str] = ()) -> Readout:
     """Each PointCloud2 message is a scan, its points moved by the pose at its stamp.
 
-    The pose comes from tf, if a chain of transforms that change leads from the cloud's frame up to
-    a root, which is the world. If not, or if a pose topic is named: from the only topic of poses
-    (PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped), with tf between the frame
-    it moves and the cloud's. Clouds in the frame that the poses are in are in the world already,
-    and the pose is their origin. Between two stamps poses are interpolated; clouds farther than
-    0.25 s from any pose are left out, with a warning. Motion within a scan is not undone.
+    The pose comes from tf, if the transforms from the cloud's frame up to its root, which is the
+    world, change. If not, or if a pose topic is named: from the only topic of poses (PoseStamped,
+    PoseWithCovarianceStamped, Odometry, TransformStamped), with tf between the frame it moves and
+    the cloud's. If there is none, from tf that stands still. Clouds in the frame that the poses
+    are in are in the world already, and the pose is their origin. Between two stamps poses are
+    interpolated; clouds farther than 0.25 s from any pose are left out, with a warning. Motion
+    within a scan is not undone.
 
     Args:
         path: a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag.
@@ -86,6 +87,9 @@ def read_bag(path: Path, topics: Sequence[str] = ()) -> Readout:
     for file in _bag_files(path):
         for message in read_messages(file):
             _take_in(bag, message, topics, decode)
+    unknown = [topic for topic in topics if topic not in bag.kinds]
+    if unknown:
+        raise ValueError(_topic_error(f"the name {unknown[0]}", [], bag))
     cloud_topics = _topics_of(bag, [CLOUD], topics)
     if len(cloud_topics) != 1:
         raise ValueError(_topic_error("PointCloud2", cloud_topics, bag))
@@ -177,11 +181,12 @@ def _world_from_clouds(
         raise ValueError(f"all clouds must be in one frame; got {frame}, {', '.join(others)}")
     stamps = np.array([cloud.stamp for cloud in clouds])
     pose_topics = _topics_of(bag, POSE_OF, topics)
-    if bag.tree.moves(frame) and not any(topic in topics for topic in pose_topics):
+    is_named = any(topic in topics for topic in pose_topics)
+    if not is_named and (bag.tree.moves(frame) or (not pose_topics and bag.tree.knows(frame))):
         poses, gaps = bag.tree.root_from(frame, stamps)
         return np.stack([poses, poses], axis=1), gaps
     if len(pose_topics) != 1:
-        kinds = "poses (or of tf that moves the clouds' frame)"
+        kinds = "poses (or tf of the clouds' frame)"
         raise ValueError(_topic_error(kinds, pose_topics, bag))
     topic = bag.poses[pose_topics[0]]
     rows = np.array(topic.rows)

@@ -40,9 +40,13 @@ class TransformTree:
             edge.stamps.append(stamp)
             edge.rows.append(row)
 
+    def knows(self, frame: str) -> bool:
+        """Whether a frame has a parent."""
+        return frame in self._edges
+
     def moves(self, frame: str) -> bool:
         """Whether something between a frame and its root changes over time."""
-        return any(self._edges[name].stamps is not None for name in self._chain(frame))
+        return any(any(row != edge.rows[0] for row in edge.rows) for edge in self._above(frame))
 
     def root_from(
         self, frame: str, stamps: NDArray[np.float64]
@@ -50,8 +54,7 @@ class TransformTree:
         """(n, 4, 4) root_from_frame at (n,) stamps, and how far the nearest known ones are [s]."""
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
         farthest = np.zeros(len(stamps))
-        for name in self._chain(frame):
-            edge = self._edges[name]
+        for edge in self._above(frame):
             rows = np.array(edge.rows)
             found = poses_from_quaternions(rows[:, :3], rows[:, 3:])
             if edge.stamps is not None:
@@ -64,21 +67,21 @@ class TransformTree:
         self, frame: str, other: str, stamps: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:
         """(n, 4, 4) frame_from_other at (n,) stamps; None if no transforms connect them."""
-        roots = [([name, *self._parents(name)])[-1] for name in (frame, other)]
+        roots = [
+            [name, *(edge.parent for edge in self._above(name))][-1] for name in (frame, other)
+        ]
         if roots[0] != roots[1]:
             return None
         poses, _ = self.root_from(frame, stamps)
         return np.linalg.inv(poses) @ self.root_from(other, stamps)[0]
 
-    def _parents(self, frame: str) -> list[str]:
-        return [self._edges[name].parent for name in self._chain(frame)]
-
-    def _chain(self, frame: str) -> list[str]:
-        """The frames from this one up that have a parent."""
-        chain: list[str] = []
+    def _above(self, frame: str) -> list[_Edge]:
+        """The transforms from a frame up to its root."""
+        seen, edges = {frame}, list[_Edge]()
         while frame in self._edges:
-            if frame in chain:
+            edges.append(self._edges[frame])
+            frame = edges[-1].parent
+            if frame in seen:
                 raise ValueError(f"frames must form a tree; {frame} is above itself")
-            chain.append(frame)
-            frame = self._edges[frame].parent
-        return chain
+            seen.add(frame)
+        return edges
