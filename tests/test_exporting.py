@@ -97,7 +97,7 @@ def test_octomap_full_trees_hold_the_clamped_log_odds(room, octomap, tmp_path):
 def test_a_map_of_real_scans_goes_to_octomap_and_back(data, octomap, tmp_path):
     scans = load_scans(data / "la3dm_sim_structured/scans.npz")
     samples = sample_rays(scans.select(torch.arange(0, len(scans), 5)), seed=0)
-    model = LardHilbertMap().fit(samples.points, samples.labels)
+    model = LardHilbertMap().fit(samples.points, samples.labels, 300)
     save_grid(model, tmp_path / "map.bt", 0.2)
     tree = octomap.OcTree(0.2)
     tree.readBinary(str(tmp_path / "map.bt").encode())
