@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import os
-import pickle
-import tempfile
 import warnings
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
+
+from lardhm_torch.files import replaced_file
 
 FORMAT_VERSION = 1
 
@@ -18,20 +20,19 @@ FORMAT_VERSION = 1
 def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
     """Write a state dict; after a failure or a kill the old file is still there, whole.
 
-    The new file is written beside the old one and takes its name in one step.
+    A path that ends in ``.safetensors`` gets that format, whose metadata holds all that is no
+    tensor, as JSON under its own key. Any other path gets torch's.
+
+    Raises:
+        FileNotFoundError: the folder of path does not exist.
+        ImportError: safetensors is asked for and not installed.
     """
-    path = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with replaced_file(path) as partial:
+        if _is_safetensors(path):
+            _write_safetensors(state, partial)
+        else:
+            with open(partial, "wb") as file:
+                torch.save(state, file)
 
 
 def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -41,16 +42,18 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
         FileNotFoundError: there is no such file.
         ValueError: the file is not a map file, is cut short, or holds more than tensors and plain
             values.
+        ImportError: the file ends in .safetensors, which is not installed.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"map file {path} does not exist")
+    read = _read_safetensors if _is_safetensors(path) else _read_torch
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of pickle protocols; the error below says enough
-            state = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, zipfile.BadZipFile, ValueError,
-            KeyError, IndexError, TypeError, AttributeError, OSError) as error:  # fmt: skip
+        state = read(path)
+    except ImportError:
+        raise
+    except Exception as error:
+        # Broken bytes surface from pickle, zipfile, torch and safetensors under a dozen types.
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ValueError(f"{path} must be a map file, whole and safe to load; {reason}") from error
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
@@ -74,7 +77,35 @@ def check_settings(extra: Any) -> dict[str, Any]:
     return settings
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _read_torch(path: Path) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pickle protocols; the error says enough
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def _is_safetensors(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".safetensors"
+
+
+def _write_safetensors(state: dict[str, Any], path: Path) -> None:
+    torch_files = _import_safetensors("torch")
+    tensors = {k: v.detach().contiguous() for k, v in state.items() if isinstance(v, Tensor)}
+    other = {k: json.dumps(v) for k, v in state.items() if not isinstance(v, Tensor)}
+    torch_files.save_file(tensors, path, metadata={"format": "pt", **other})
+
+
+def _read_safetensors(path: Path) -> dict[str, Any]:
+    with _import_safetensors().safe_open(path, framework="pt") as file:
+        # Copies: the file is mapped into memory, and may be replaced.
+        state = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata() or {}
+    return {**state, **{k: json.loads(v) for k, v in metadata.items() if k != "format"}}
+
+
+def _import_safetensors(part: str = "") -> Any:
+    try:
+        return importlib.import_module(f"safetensors.{part}".rstrip("."))
+    except ImportError as error:
+        raise ImportError(
+            'map files in .safetensors need safetensors: pip install "lardhm_torch[io]"'
+        ) from error

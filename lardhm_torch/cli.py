@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +82,7 @@ def query(arguments: argparse.Namespace) -> None:
     import torch
 
     from lardhm_torch import LardHilbertMap
+    from lardhm_torch.files import replaced_file
     from lardhm_torch.io import load_points
 
     model = LardHilbertMap.load(arguments.map)
@@ -92,14 +91,15 @@ def query(arguments: argparse.Namespace) -> None:
         points = points[:, :-1]  # flat scans, as `fit --dim 2` takes them
     with torch.no_grad():
         probability = model(points).float().numpy()
-    _write_atomically(arguments.output, lambda file: np.save(file, probability))
+    with replaced_file(arguments.output) as partial, open(partial, "wb") as file:
+        np.save(file, probability)
     print(f"{len(probability)} probabilities -> {arguments.output}")
 
 
 def mesh(arguments: argparse.Namespace) -> None:
     """A map to a surface."""
     from lardhm_torch import LardHilbertMap, extract_mesh
-    from lardhm_torch.meshing import save_mesh
+    from lardhm_torch.mesh_files import save_mesh
 
     surface = extract_mesh(
         LardHilbertMap.load(arguments.map),
@@ -110,6 +110,16 @@ def mesh(arguments: argparse.Namespace) -> None:
     )
     save_mesh(surface, arguments.output)
     print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
+
+
+def grid(arguments: argparse.Namespace) -> None:
+    """A map to a grid of probabilities: .npz, or OctoMap's .bt and .ot."""
+    from lardhm_torch import LardHilbertMap
+    from lardhm_torch.exporting import save_grid
+
+    model = LardHilbertMap.load(arguments.map)
+    count = save_grid(model, arguments.output, arguments.resolution)
+    print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -153,8 +163,16 @@ def info(arguments: argparse.Namespace) -> None:
 def _load_scans(arguments: argparse.Namespace, dim: int | None = None) -> Scans:
     """The scans named on the command line, without z where ``--dim 2`` or a 2-D map asks for it."""
     from lardhm_torch import load_scans
+    from lardhm_torch.io import Camera
 
-    scans = load_scans(arguments.scans, origin=getattr(arguments, "origin", None))
+    camera = Camera(intrinsics=arguments.camera, pixel_step=arguments.pixel_step)
+    scans = load_scans(
+        arguments.scans,
+        arguments.origin,
+        frame=arguments.frame,
+        topic=arguments.topic,
+        camera=camera,
+    )
     dim = getattr(arguments, "dim", None) or dim or scans.dim
     if dim == scans.dim - 1:
         return scans.drop_constant_column()
@@ -169,24 +187,12 @@ def _report_dropped(dropped: dict[str, int]) -> None:
             print(f"{count} rays {reason}", file=sys.stderr)
 
 
-def _write_atomically(path: str, write: Any) -> None:
-    target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="lardhm",
         description="Continuous, probabilistic maps of occupancy from range scans.",
-        epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las.",
+        epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las, "
+        "e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
     )
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
@@ -235,6 +241,11 @@ def _map_verbs(verb: Any) -> None:
     sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
     sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
 
+    sub = verb(grid)
+    sub.add_argument("map")
+    _output(sub)
+    sub.add_argument("--resolution", type=float, default=0.1, help="edge of a cell [m] (0.1)")
+
     sub = verb(evaluate)
     sub.add_argument("map")
     _scans(sub)
@@ -250,10 +261,28 @@ def _scans(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("scans", nargs="+", metavar="SCANS")
     sub.add_argument(
         "--origin",
-        type=lambda text: tuple(float(part) for part in text.split(",")),
+        type=_numbers,
         metavar="X,Y,Z",
         help="sensor position of files that do not tell it",
     )
+    sub.add_argument(
+        "--frame",
+        choices=("sensor", "world"),
+        help="of points beside a pose file: moved by the poses, or only seen from there",
+    )
+    sub.add_argument(
+        "--topic", action="append", default=[], help="of a bag's clouds or poses, if there are more"
+    )
+    sub.add_argument(
+        "--camera", type=_numbers, metavar="FX,FY,CX,CY", help="of depth images without intrinsics"
+    )
+    sub.add_argument(
+        "--pixel-step", type=int, default=4, help="of depth images, rows and columns read (4)"
+    )
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(","))
 
 
 def _output(sub: argparse.ArgumentParser) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +20,6 @@ BLOCK_CELLS = 24  # cells along a block's edge
 CHUNK_VERTICES = 1 << 18  # vertices probed at a time
 PROBES = (1.0, 2.0, 3.0)  # standard deviations before and behind a face where evidence is sought
 COLORS = ("height", "cluster", "probability")
-MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 
 
 def extract_mesh(
@@ -83,7 +80,7 @@ def extract_mesh(
             upper.amax(dim=0) + resolution,
         )  # whole cells cover the boxes
     cells = ((end - corner) / resolution + 1e-6).floor().long().clamp(min=1)
-    blocks = _active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
+    blocks = active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
     vertices, faces = _march_blocks(model, corner, resolution, blocks, cells, level, progress)
     world = vertices * resolution + corner.numpy()
     nearest = _nearest_supporters(model, supporters, world)
@@ -93,24 +90,6 @@ def extract_mesh(
         mesh.update_faces(seen[faces].all(axis=1))
     mesh.remove_unreferenced_vertices()
     return mesh
-
-
-def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
-    """Write a mesh, its format chosen by the extension; an existing file is replaced at the end.
-
-    Raises:
-        ValueError: the extension is not one of .glb, .obj, .off, .ply, .stl.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        known = ", ".join(MESH_SUFFIXES)
-        raise ValueError(f"path must end in one of {known} for a mesh; got {path.name!r}")
-    partial = path.with_name(f".{path.name}.partial{path.suffix}")
-    try:
-        mesh.export(partial, file_type=path.suffix[1:].lower())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _check_meshing(
@@ -132,7 +111,7 @@ def _check_meshing(
         raise ValueError(f"evidence must be >= 0, or None to keep all faces; got {evidence}")
 
 
-def _active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
+def active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
     """(B, 3) numbers of the blocks that some box touches, ascending; boxes in cells from the corner."""
     last_block = (cells - 1) // BLOCK_CELLS
     first = (lower / BLOCK_CELLS).floor().long().clamp(min=0).minimum(last_block)

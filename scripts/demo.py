@@ -16,7 +16,7 @@ from lardhm_torch import (
     simulate_room,
     split_rays,
 )
-from lardhm_torch.meshing import save_mesh
+from lardhm_torch.mesh_files import save_mesh
 from lardhm_torch.metrics import evaluate, format_metrics, mesh_metrics
 from lardhm_torch.rendering import render_mesh, render_slice
 from lardhm_torch.simulation import room_mesh

@@ -9,99 +9,47 @@ compiled library is seen and named. Exit code 0 if all formats pass.
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import faulthandler
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import traceback
+import warnings
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import torch
+from healthy_files import (
+    BagMaker,
+    bag_messages,
+    checksums_mended,
+    write_depth_images,
+    write_e57,
+    write_kitti,
+    write_las,
+    write_pcd,
+    write_ply,
+    write_tum,
+)
 
+from lardhm_torch import LardHilbertMap
 from lardhm_torch.io import load_points, load_scans, save_scans
 from lardhm_torch.scans import Scans
 
-SECONDS_A_FILE = 5
+SECONDS_A_FILE = 5  # of the processor
 MEMORY_ON_TOP = 1 << 30  # [bytes] that a reader may need for a file of some kilobytes
 NUM_POINTS = 300
 HUGE = (0, 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 
 
-def write_ply(path: Path, points: np.ndarray, encoding: str) -> None:
-    """A PLY file with points and one origin per point."""
-    header = f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {len(points)}\n"
-    header += "".join(f"property double {name}\n" for name in ("x", "y", "z", "ox", "oy", "oz"))
-    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    rows = np.hstack([points, np.ones_like(points)])
-    if encoding == "ascii":
-        body = "\n".join(" ".join(map(repr, row)) for row in rows.tolist()).encode() + b"\n3 0 1 2"
-    else:
-        order = "<" if "little" in encoding else ">"
-        body = rows.astype(f"{order}f8").tobytes() + b"\3" + np.arange(3, dtype="<i4").tobytes()
-    path.write_bytes(header.encode() + body)
-
-
-def write_pcd(path: Path, points: np.ndarray, encoding: str) -> None:
-    """A PCD file with VIEWPOINT; compressed ones hold copies that run into themselves."""
-    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
-    header += f"COUNT 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 1 2 3 1 0 0 0\n"
-    header += f"POINTS {len(points)}\nDATA {encoding}\n"
-    rows = np.hstack([points, np.zeros((len(points), 1))]).astype("<f4")
-    if encoding == "ascii":
-        body = "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode()
-    elif encoding == "binary":
-        body = rows.tobytes()
-    else:
-        packed, size = compress_lzf(np.ascontiguousarray(rows.T).tobytes()), rows.nbytes
-        body = len(packed).to_bytes(4, "little") + size.to_bytes(4, "little") + packed
-    path.write_bytes(header.encode() + body)
-
-
-def compress_lzf(content: bytes) -> bytes:
-    """LZF of content: runs of one byte as copies that run into themselves, the rest as literals."""
-    packed, literal, i = bytearray(), bytearray(), 0
-    while i < len(content) or literal:
-        run = 0
-        while i and i + run < len(content) and run < 264 and content[i + run] == content[i - 1]:
-            run += 1
-        if literal and (run >= 3 or len(literal) == 32 or i == len(content)):
-            packed += bytes([len(literal) - 1]) + literal
-            literal = bytearray()
-        if run >= 9:
-            packed += bytes([7 << 5, run - 9, 0])
-        elif run >= 3:
-            packed += bytes([(run - 2) << 5, 0])
-        elif i < len(content):
-            literal.append(content[i])
-            run = 1
-        i += run
-    return bytes(packed)
-
-
-def write_las(path: Path, points: np.ndarray, point_format: int) -> None:
-    """A LAS 1.4 or LAZ file; formats from 6 on are compressed in layers, older ones are not."""
-    import laspy
-
-    las = laspy.create(file_version="1.4", point_format=point_format)
-    las.header.scales = [1e-3] * 3
-    las.x, las.y, las.z = points.T
-    las.return_number = np.ones(len(points), dtype=np.uint8)
-    las.write(path)
-
-
-def write_kitti(folder: Path, points: np.ndarray) -> Path:
-    """A KITTI scan; the folder gets its poses.txt too."""
-    (folder / "poses.txt").write_text("1 0 0 5 0 1 0 6 0 0 1 7\n")
-    np.hstack([points, points[:, :1]]).astype("<f4").tofile(folder / "000000.bin")
-    return folder / "000000.bin"
-
-
-def healthy_file(name: str, folder: Path) -> Path:
-    """One small whole file of a format, such as "ply-ascii" or "poses"."""
-    points = np.random.default_rng(0).normal(size=(NUM_POINTS, 3)).round(3)
+def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
+    """One small whole file of a format, such as "ply-ascii" or "poses", and what is to be read."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(NUM_POINTS, 3)).round(3)
     extension, _, variant = name.partition("-")
     path = folder / f"scan.{extension}"
     if extension == "npz":
@@ -117,22 +65,64 @@ def healthy_file(name: str, folder: Path) -> Path:
         write_pcd(path, points, variant)
     elif extension in ("las", "laz"):
         write_las(path, points, int(variant or 6))
+    elif extension == "e57":
+        write_e57(path, [points[:100], points[100:]], POSES)
+    elif extension in ("bag", "db3", "mcap"):
+        maker = BagMaker(extension == "bag")
+        messages = bag_messages(maker, [points[:100], points[100:]], POSES)
+        messages.append(maker.transform(POSES[1], 100.0, ("odom", "base")))
+        maker.write(path, messages, variant)
+    elif extension in ("depth", "tum"):
+        return healthy_images(extension, variant, folder, rng)
+    elif extension == "map":
+        path = folder / f"map.{variant}"
+        LardHilbertMap().fit(torch.as_tensor(points), torch.arange(NUM_POINTS) % 2, 20).save(path)
     elif extension in ("bin", "poses"):
-        path = write_kitti(folder, points)
-        path = path if extension == "bin" else folder / "poses.txt"
+        read = write_kitti(folder, points)
+        if variant == "tum":
+            write_tum(folder / "poses.txt", [0.0, 1.0], POSES)
+        return (read if extension == "bin" else folder / "poses.txt"), read
     else:
         rows = np.hstack([points, np.ones_like(points)])
         np.savetxt(path, rows, delimiter=",", header="x,y,z,ox,oy,oz", comments="")
-    return path
+    return path, path
 
 
-FORMATS = [
-    *("npz", "npz-deflate", "npy", "csv", "txt", "xyz", "bin", "poses"),
-    *("ply-ascii", "ply-binary_little_endian", "ply-binary_big_endian"),
-    *("pcd-ascii", "pcd-binary", "pcd-binary_compressed"),
-]
-if importlib.util.find_spec("laspy") and importlib.util.find_spec("lazrs"):
-    FORMATS += ["las", "laz-6", "laz-3"]
+def healthy_images(
+    layout: str, variant: str, folder: Path, rng: np.random.Generator
+) -> tuple[Path, Path]:
+    """Two depth images in the 7-Scenes or TUM layout; variant says which of the files to break."""
+    images = [rng.integers(0, 4000, size=(24, 32)) for _ in POSES]
+    path = write_depth_images(folder, images, POSES)
+    if layout == "tum":
+        names = sorted(file.name for file in folder.glob("*.png"))
+        lines = [f"{100 + number}.5 {name}\n" for number, name in enumerate(names)]
+        (folder / "depth.txt").write_text("# stamp file\n" + "".join(lines))
+        write_tum(folder / "groundtruth.txt", [100.4, 100.6, 101.4, 101.6], POSES[[0, 0, 1, 1]])
+    files = {"png": path, "pose": folder / "frame-000001.pose.txt"}
+    files |= {"camera": folder / "camera-intrinsics.txt", "list": folder / "depth.txt"}
+    return files.get(variant, folder / "groundtruth.txt"), folder
+
+
+POSES = np.tile(np.eye(4), (2, 1, 1))
+POSES[1, :3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+FORMATS = {  # and the library that reads or makes them
+    **dict.fromkeys(("npz", "npz-deflate", "npy", "csv", "txt", "xyz"), ""),
+    **dict.fromkeys(("bin", "poses", "poses-tum", "map-pt"), ""),
+    **dict.fromkeys(("ply-ascii", "ply-binary_little_endian", "ply-binary_big_endian"), ""),
+    **dict.fromkeys(("pcd-ascii", "pcd-binary", "pcd-binary_compressed"), ""),
+    **dict.fromkeys(("las", "laz-6", "laz-3"), "lazrs"),
+    **dict.fromkeys(("depth-png", "depth-pose", "depth-camera", "tum-list", "tum-poses"), "PIL"),
+    **dict.fromkeys(("bag", "bag-bz2", "bag-lz4", "db3", "db3-zstd-message"), "rosbags"),
+    **dict.fromkeys(("mcap", "mcap-zstd"), "rosbags"),
+    "e57": "pye57",
+    "map-safetensors": "safetensors",
+}
+
+
+def available_formats() -> list[str]:
+    """The formats whose library is installed."""
+    return [name for name, library in FORMATS.items() if not library or find_spec(library)]
 
 
 def mutate(content: bytes, rng: np.random.Generator) -> bytes:
@@ -140,7 +130,7 @@ def mutate(content: bytes, rng: np.random.Generator) -> bytes:
     changed = bytearray(content)
     for _ in range(rng.integers(1, 5)):
         kind = rng.integers(7)
-        header = min(len(changed), 400)
+        header = min(len(changed), 400 if rng.random() < 0.7 else 1 << 20)  # or anywhere
         if kind == 0:  # cut
             del changed[rng.integers(len(changed) + 1) :]
         elif kind == 1 and changed:  # bit flips anywhere
@@ -169,45 +159,52 @@ def mutate(content: bytes, rng: np.random.Generator) -> bytes:
     return bytes(changed)
 
 
-def outcome(path: Path, named: Path, is_points: bool) -> str:
-    """What reading a file came to: "Scans" or "error"; anything else is a failure and raises."""
+def read(name: str, path: Path) -> None:
+    """Read a file of a format as its users would."""
+    if name.startswith("map"):
+        LardHilbertMap.load(path)
+    elif name == "npy":
+        load_points(path)
+    else:
+        scans = load_scans(path, origin=(0, 0, 0) if name.startswith("la") else None)
+        assert len(scans.ends) == len(scans.scan_id)
+
+
+def outcome(name: str, path: Path) -> str:
+    """What reading a file came to: "read" or "error"; anything else is a failure and raises."""
     try:
-        if is_points:
-            load_points(path)
-        else:
-            needs_origin = path.suffix in (".las", ".laz")
-            scans = load_scans(path, origin=(0, 0, 0) if needs_origin else None)
-            assert len(scans.ends) == len(scans.scan_id)
-        return "Scans"
+        read(name, path)
+        return "read"
     except (ValueError, OSError) as error:
         cause: BaseException | None = error
         while cause is not None:
             if isinstance(cause, MemoryError):
                 raise AssertionError("memory ran out before the file was checked") from error
             cause = cause.__cause__
-        if str(named) not in str(error):
+        if str(path) not in str(error):
             raise AssertionError("the error does not name the file") from error
         return "error"
 
 
 def fuzz(name: str, mutations: int, seed: int) -> Counter[str]:
-    """How often mutated files of one format gave Scans, and how often an error."""
+    """How often mutated files of one format were read, and how often they gave an error."""
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        path = healthy_file(name, Path(folder))
+        path, named = healthy_file(name, Path(folder))
         content = path.read_bytes()
-        is_poses, is_points = name == "poses", name == "npy"
-        read = path.with_name("000000.bin") if is_poses else path
-        assert outcome(read, read, is_points) == "Scans"
+        assert outcome(name, named) == "read"
         for number in range(mutations):
-            path.write_bytes(mutate(content, np.random.default_rng([seed, number])))
-            signal.alarm(SECONDS_A_FILE)
+            broken = mutate(content, np.random.default_rng([seed, number]))
+            if name == "e57" and number % 4:  # else the first checksum is all that is tested
+                broken = checksums_mended(broken)
+            path.write_bytes(broken)
+            print(f"{name}: mutation {number} of seed {seed}", file=sys.stderr)
+            signal.setitimer(signal.ITIMER_PROF, SECONDS_A_FILE)
+            signal.alarm(60 * SECONDS_A_FILE)  # on the clock: it may wait for ever, too
             try:
-                counts[outcome(read, read, is_points)] += 1
-            except BaseException:
-                print(f"{name}: mutation {number} of seed {seed}", file=sys.stderr)
-                raise
+                counts[outcome(name, named)] += 1
             finally:
+                signal.setitimer(signal.ITIMER_PROF, 0)
                 signal.alarm(0)
     return counts
 
@@ -221,8 +218,8 @@ def limit_memory() -> None:
 
 def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
     """Fuzz one format in a process of its own; True if it passed."""
-    command = [sys.executable, __file__, "--format", name, "--seed", str(arguments.seed)]
-    command += ["--mutations", str(arguments.mutations)]
+    command = [sys.executable, __file__, name, "--seed", str(arguments.seed)]
+    command += ["--mutations", str(arguments.mutations), "--here"]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     print(run.stdout.strip() if run.returncode == 0 else f"{name}: FAILED ({run.returncode})")
     if run.returncode:
@@ -231,22 +228,29 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
 
 
 def main() -> int:
-    """Fuzz one format here, or all of them apart."""
+    """Fuzz formats one after the other here, or each in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mutations", type=int, default=1000, help="files per format")
+    parser.add_argument("formats", nargs="*", help=f"{', '.join(FORMATS)}; all that can be read")
+    parser.add_argument("--mutations", type=int, default=1000, help="files per format (1000)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--format", choices=FORMATS, help="only this one")
+    parser.add_argument("--here", action="store_true", help="in this process")
     arguments = parser.parse_args()
-    if arguments.format is None:
-        passed = [fuzz_apart(name, arguments) for name in FORMATS]
+    names = arguments.formats or available_formats()
+    if not arguments.here:
+        passed = [fuzz_apart(name, arguments) for name in names]
         return 0 if all(passed) else 1
+    warnings.simplefilter("ignore")
+    faulthandler.enable()
+    for number in (signal.SIGPROF, signal.SIGALRM):  # say where, then end the process
+        faulthandler.register(number, chain=True)
     limit_memory()
-    try:
-        counts = fuzz(arguments.format, arguments.mutations, arguments.seed)
-    except BaseException:
-        traceback.print_exc()
-        return 1
-    print(f"{arguments.format}: {counts['Scans']} read, {counts['error']} clear errors")
+    for name in names:
+        try:
+            counts = fuzz(name, arguments.mutations, arguments.seed)
+        except BaseException:
+            traceback.print_exc()
+            return 1
+        print(f"{name}: {counts['read']} read, {counts['error']} clear errors", flush=True)
     return 0
 
 

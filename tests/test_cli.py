@@ -5,6 +5,8 @@ import sys
 import numpy as np
 import pytest
 import torch
+import trimesh
+from healthy_files import BagMaker, bag_messages
 
 from lardhm_torch import LardHilbertMap, Scans, load_scans, save_scans
 from lardhm_torch.cli import main
@@ -54,6 +56,69 @@ def test_mesh_writes_a_surface(folder, capsys):
     run("mesh", folder / "map.pt", "-o", folder / "mesh.ply", "--resolution", "0.1")
     assert (folder / "mesh.ply").stat().st_size > 10_000
     assert "faces" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_mesh_writes_the_format_of_the_extension(folder, suffix):
+    run("mesh", folder / "map.pt", "-o", folder / f"mesh.{suffix}", "--resolution", "0.2")
+    assert len(trimesh.load(folder / f"mesh.{suffix}", force="mesh").faces) > 1000
+
+
+def test_grid_writes_probabilities_or_an_octomap(folder, capsys, tmp_path):
+    run("grid", folder / "map.pt", "-o", folder / "grid.npz", "--resolution", "0.5")
+    with np.load(folder / "grid.npz") as cells:
+        assert cells["probability"].ndim == 3
+        assert f"{cells['probability'].size} cells of 0.5 m" in capsys.readouterr().out
+    pytest.importorskip("octomap", reason="octomap-python is not installed (extra octomap)")
+    run("grid", folder / "map.pt", "-o", folder / "map.bt", "--resolution", "0.5")
+    assert (folder / "map.bt").read_bytes().startswith(b"# Octomap OcTree binary file")
+
+
+def test_maps_in_safetensors_are_maps_as_others(folder, capsys):
+    pytest.importorskip("safetensors", reason="safetensors is not installed (extra io)")
+    run("fit", folder / "train.npz", "--clusters", 50, "-o", folder / "map.safetensors")
+    run("evaluate", folder / "map.safetensors", folder / "test.npz")
+    run("info", folder / "map.safetensors", "--json")
+    assert "clusters" in capsys.readouterr().out
+
+
+def test_a_bag_of_a_robot_makes_a_map(folder, tmp_path, capsys):
+    pytest.importorskip("rosbags", reason="rosbags is not installed (extra io)")
+    scans, maker = load_scans(folder / "train.npz"), BagMaker(is_ros1=False)
+    poses = np.tile(np.eye(4), (scans.num_scans, 1, 1))
+    poses[:, :3, 3] = scans.origins
+    local = [
+        (scans.ends[scans.scan_id == number] - scans.origins[number]).numpy()
+        for number in range(scans.num_scans)
+    ]
+    messages = bag_messages(maker, local, poses)
+    messages.append(maker.pose(poses[0], 100.0, topic="/goal"))
+    maker.write(tmp_path / "robot.mcap", messages)
+    error = fails(capsys, "fit", tmp_path / "robot.mcap", "-o", tmp_path / "map.pt")
+    assert "2 topics are poses" in error
+    assert "--topic" in error
+    words = [tmp_path / "robot.mcap", "--topic", "/odom", "-o", tmp_path / "map.pt"]
+    run("fit", *words, "--clusters", 100)
+    run("evaluate", tmp_path / "map.pt", folder / "test.npz", "--json")
+    table = json.loads(capsys.readouterr().out.partition("\n")[2])
+    assert table["unif"]["balanced_accuracy"] > 0.9
+
+
+def test_depth_images_make_a_map(data, tmp_path):
+    pytest.importorskip("PIL", reason="pillow is not installed (extra io)")
+    frames = data / "sevenscenes_rgbd/frames"
+    options = ["--camera", "585,585,320,240", "--pixel-step", 20]
+    run("fit", frames, *options, "--clusters", 100, "-o", tmp_path / "map.pt")
+    run("info", tmp_path / "map.pt")
+
+
+def test_scans_of_the_sensors_frame_are_moved_by_a_pose_file(tmp_path):
+    np.savetxt(tmp_path / "a.xyz", [[1, 2, 3], [4, 5, 6]])
+    np.savetxt(tmp_path / "poses.txt", [[1, 0, 0, 10, 0, 1, 0, 20, 0, 0, 1, 30]])
+    words = ["--frame", "sensor", "-o", tmp_path / "one.npz", tmp_path / "two.npz"]
+    run("split", tmp_path / "a.xyz", *words)
+    ends = torch.cat([load_scans(tmp_path / name).ends for name in ("one.npz", "two.npz")])
+    assert sorted(ends.tolist()) == [[11, 22, 33], [14, 25, 36]]
 
 
 def test_evaluate_prints_a_table_or_json(folder, capsys):

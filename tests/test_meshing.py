@@ -7,7 +7,7 @@ import trimesh
 from torch import nn
 
 from lardhm_torch import meshing
-from lardhm_torch.meshing import extract_mesh, save_mesh
+from lardhm_torch.meshing import extract_mesh
 
 
 class GaussianMap(nn.Module):
@@ -179,37 +179,6 @@ def test_colors_by_cluster_and_by_probability_are_those_of_the_nearest_cluster()
 
 def test_without_color_the_mesh_has_none():
     assert extract_mesh(ball_in_free_space(), 0.1, color=None).visual.kind is None
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
-def test_a_saved_mesh_is_read_back(suffix, tmp_path):
-    mesh = extract_mesh(ball_in_free_space(), 0.1)
-    save_mesh(mesh, tmp_path / f"ball{suffix}")
-    again = trimesh.load(tmp_path / f"ball{suffix}", force="mesh")
-    assert len(again.faces) == len(mesh.faces)
-    np.testing.assert_allclose(again.bounds, mesh.bounds, atol=1e-5)
-    assert [p.name for p in tmp_path.iterdir()] == [f"ball{suffix}"]
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "mesh.ply"
-    path.write_text("old")
-
-    def full_disk(partial, **_):
-        partial.write_text("half")
-        raise OSError("no space left")
-
-    mesh = extract_mesh(ball_in_free_space(), 0.1)
-    monkeypatch.setattr(mesh, "export", full_disk)
-    with pytest.raises(OSError, match="no space"):
-        save_mesh(mesh, path)
-    assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
-    assert path.read_text() == "old"
-
-
-def test_an_unknown_mesh_format_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"one of .glb, .obj, .off, .ply, .stl.*got 'a.xyz'"):
-        save_mesh(trimesh.creation.box(), tmp_path / "a.xyz")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ UTM = torch.tensor([5e5, 4.5e6, 100.0], dtype=torch.float64)
 
 @pytest.fixture
 def octomap():
-    return pytest.importorskip("octomap", reason="octomap-python is not installed (extra bench)")
+    return pytest.importorskip("octomap", reason="octomap-python is not installed (extra octomap)")
 
 
 def wall_scan(shift: torch.Tensor | None = None) -> Scans:
@@ -101,5 +101,5 @@ def test_what_octomap_cannot_do_is_refused(octomap):
 
 def test_without_the_library_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "octomap", None)
-    with pytest.raises(ImportError, match=r"lardhm_torch\[bench\]"):
+    with pytest.raises(ImportError, match=r"lardhm_torch\[octomap\]"):
         OctoMapBaseline().fit(wall_scan())

@@ -85,8 +85,8 @@ def new_tree(resolution: float) -> Any:
         import octomap
     except ImportError as error:
         raise ImportError(
-            "OctoMapBaseline needs octomap-python, which is not installed; "
-            'install the extra: pip install "lardhm_torch[bench]"'
+            "OctoMap trees need octomap-python, which is not installed; "
+            'install the extra: pip install "lardhm_torch[octomap]"'
         ) from error
     return octomap.OcTree(resolution)
 

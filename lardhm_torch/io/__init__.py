@@ -3,11 +3,19 @@
 | extension | coordinates | sensor position |
 |---|---|---|
 | ``.npz`` | ``points`` (N, D), world | ``origins`` (S, D), ``scan_id`` (N,) |
-| ``.ply`` | properties x y z, world | properties ox oy oz, or ``origin=`` |
-| ``.pcd`` | fields x y z, world | VIEWPOINT |
-| ``.xyz .txt .csv`` | columns x y z, world | columns ox oy oz, or ``origin=`` |
-| ``.bin`` (KITTI) | x y z intensity, sensor frame | ``poses.txt`` beside it or one folder up |
-| ``.las .laz`` | scaled X Y Z, world | ``origin=`` |
+| ``.ply`` | properties x y z | properties ox oy oz, poses, or ``origin=`` |
+| ``.pcd`` | fields x y z | VIEWPOINT, poses, or ``origin=`` |
+| ``.xyz .txt .csv`` | columns x y z | columns ox oy oz, poses, or ``origin=`` |
+| ``.las .laz`` | scaled X Y Z | poses, or ``origin=`` |
+| ``.bin`` (KITTI) | x y z intensity, sensor frame | poses |
+| ``.e57`` | cartesian or spherical, scanner frame | pose of each scan |
+| ``.bag .db3 .mcap``, folder of a ROS 2 bag | PointCloud2, its frame | tf, or a topic of poses |
+| folder of depth images (7-Scenes, TUM) | 16-bit depth, camera frame | pose files |
+
+Poses are a file poses.txt, groundtruth.txt or trajectory.txt beside the scans or one folder up,
+each line in KITTI's or TUM's format (`poses.pose_beside`). Whether the points of a PLY, PCD, text
+or LAS file lie in the world or still in the sensor's frame, no file says: the world is assumed,
+``frame="sensor"`` says the other. The rest is in the readers' docstrings.
 
 Coordinates are float64 from the file on, so UTM loses nothing. Columns named scan_id, is_return
 and target_index (or return_number) are read where a format has named columns. Points that are NaN
@@ -17,20 +25,26 @@ are kept: sampling drops and counts them.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.io.bag_scans import is_bag_folder, read_bag
+from lardhm_torch.io.e57 import read_e57
+from lardhm_torch.io.frames import placed
 from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import read_las
 from lardhm_torch.io.numpy_files import read_npy, read_npz, read_npz_points, write_npz
-from lardhm_torch.io.paths import expand_paths
+from lardhm_torch.io.paths import POSE_FILES, expand_paths
 from lardhm_torch.io.pcd import read_pcd
 from lardhm_torch.io.ply import read_ply
+from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
+from lardhm_torch.io.rgbd import Camera, is_rgbd_folder, read_rgbd
 from lardhm_torch.io.text import read_text
 from lardhm_torch.scans import Scans, concatenate_scans
 
@@ -46,28 +60,55 @@ _READERS: dict[str, Callable[[Path], Readout]] = {
     ".bin": read_kitti,
     ".las": read_las,
     ".laz": read_las,
+    ".e57": read_e57,
+    ".bag": read_bag,
+    ".db3": read_bag,
+    ".mcap": read_bag,
 }
 _POINT_READERS = {**_READERS, ".npz": read_npz_points, ".npy": read_npy}
+_FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rgbd_folder}
 
 
-def load_scans(path: PathLike | Sequence[PathLike], origin: Sequence[float] | None = None) -> Scans:
+def load_scans(
+    path: PathLike | Sequence[PathLike],
+    origin: Sequence[float] | None = None,
+    *,
+    frame: str | None = None,
+    topic: str | Sequence[str] = (),
+    camera: Camera | None = None,
+) -> Scans:
     """The scans of one file, of several, or of all scan files of a folder, in order.
 
     Each file is one scan, unless it tells its scans apart itself. A folder is read in natural
-    order (scan_10 after scan_9), without its subfolders.
+    order (scan_10 after scan_9), without its subfolders; the folder of a ROS 2 bag or of depth
+    images is read as one.
 
     Args:
         path: a file, a folder, or several of them.
         origin: (D,) sensor position in the world [m] for files that carry none. It also takes the
-            place of a VIEWPOINT at zero, which PCD writers put when they know no pose.
+            place of a VIEWPOINT or pose at zero, which writers put when they know none.
+        frame: what the points of PLY, PCD, text and LAS files are in. "sensor": the pose of each
+            file (a pose file's, or VIEWPOINT) moves them into the world; "world": a pose file only
+            says where the sensor stood; None: as "world", but pose files are not looked for.
+        topic: of a bag's clouds, of its poses, or both; needed if there are several.
+        camera: of a folder of depth images.
 
     Raises:
         FileNotFoundError: there is no such file or folder.
         ValueError: a file cannot be read, has no sensor position, or is of another dimension.
         ImportError: a file needs an optional library.
     """
-    files = expand_paths(path, _READERS)
-    readouts = [_read(file, _READERS) for file in files]
+    if frame not in (None, "sensor", "world"):
+        raise ValueError(f'frame must be "sensor", "world" or None; got {frame!r}')
+    topics = (topic,) if isinstance(topic, str) else tuple(topic)
+    readers: dict[str, Callable[[Path], Readout]] = {
+        **_READERS,
+        **dict.fromkeys((".bag", ".db3", ".mcap"), partial(read_bag, topics=topics)),
+        "a ROS 2 bag": partial(read_bag, topics=topics),
+        "a folder of depth images": partial(read_rgbd, camera=camera or Camera()),
+    }
+    files = expand_paths(path, _READERS, _kind_of_folder)
+    readouts = [_read(file, readers, frame) for file in files]
     if origin is not None and not any(readout.needs_origin for readout in readouts):
         raise ValueError(
             "origin must be left out when the files carry their own sensor positions; "
@@ -117,11 +158,20 @@ def load_points(path: PathLike) -> Tensor:
     return torch.from_numpy(_read(file, _POINT_READERS).ends)
 
 
-def _read(file: Path, readers: dict[str, Callable[[Path], Readout]]) -> Readout:
-    """One file through the reader of its extension; whatever is wrong names the file."""
+def _kind_of_folder(folder: Path) -> str | None:
+    """What a folder that is read as one is; None for a folder of scan files."""
+    return next((kind for kind, is_kind in _FOLDER_KINDS.items() if is_kind(folder)), None)
+
+
+def _read(
+    file: Path, readers: Mapping[str, Callable[[Path], Readout]], frame: str | None = None
+) -> Readout:
+    """One file or folder through its reader; whatever is wrong names it."""
+    kind = (_kind_of_folder(file) if file.is_dir() else None) or file.suffix.lower()
     try:
         with np.errstate(invalid="ignore", over="ignore"):  # NaN and inf are the sampler's to count
-            return readers[file.suffix.lower()](file)
+            readout = readers[kind](file)
+            return readout if frame is None else placed(readout, file, frame)
     except ImportError:
         raise
     except OSError as error:
@@ -144,9 +194,11 @@ def _scans_from(readout: Readout, file: Path, origin: Sequence[float] | None) ->
             )
         origins = torch.tensor([tuple(origin)] * readout.num_scans, dtype=torch.float64).numpy()
     if origins is None:
+        poses = find_beside(file, POSE_FILES)
+        hint = "" if poses is None else f' For {poses.name}: frame="sensor" or frame="world".'
         raise ValueError(
             f"{file} must say where the sensor stood, and it does not. {readout.origin_cure} or "
-            "give it: load_scans(path, origin=(x, y, z)), --origin on the command line."
+            f"give it: load_scans(path, origin=(x, y, z)), --origin on the command line.{hint}"
         )
     columns = {
         "origins": origins,

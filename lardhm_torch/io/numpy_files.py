@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from lardhm_torch.files import replaced_file
 from lardhm_torch.io.readout import Readout, whole_numbers
 
 _DEFLATE_RATIO = 1032  # no deflate stream expands further
@@ -64,23 +65,13 @@ def read_npy(path: Path) -> Readout:
 
 
 def write_npz(path: Path, arrays: dict[str, NDArray]) -> None:
-    """Write arrays to path in one step: temporary file in the same folder, then os.replace.
+    """Write arrays to path in one step.
 
     Raises:
         FileNotFoundError: the folder does not exist.
     """
-    path = Path(os.path.realpath(path))  # through a link: its target is replaced, not the link
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"path must be in a folder that exists; there is no {path.parent}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replaced_file(path) as partial, open(partial, "wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def _points_of(archive: zipfile.ZipFile) -> NDArray[np.float64]:

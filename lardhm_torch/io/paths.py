@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+POSE_FILES = ("poses.txt", "groundtruth.txt", "trajectory.txt")
 # Text files that usually lie beside scans and are none.
-_NOT_SCANS = re.compile(r"(.*\.)?(poses?|calib|times|timestamps|readme|licen[cs]e)\.txt", re.I)
+_NOT_SCANS = re.compile(
+    r"(.*\.)?(poses?|groundtruth|trajectory|calib|times|timestamps|readme|licen[cs]e)\.txt", re.I
+)
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
@@ -22,9 +25,11 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
 
 
 def expand_paths(
-    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], supported: Collection[str]
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    supported: Collection[str],
+    kind_of_folder: Callable[[Path], str | None] = lambda folder: None,
 ) -> list[Path]:
-    """The files a file, a folder or a list of both stands for.
+    """The files a file, a folder or a list of both stands for; folders of a kind stay folders.
 
     Raises:
         FileNotFoundError: there is no such file or folder.
@@ -32,18 +37,20 @@ def expand_paths(
     """
     if isinstance(path, (str, os.PathLike)):
         path = [path]
-    files = [file for entry in path for file in _expand(Path(entry), supported)]
+    files = [file for entry in path for file in _expand(Path(entry), supported, kind_of_folder)]
     if not files:
         raise ValueError("path must name at least one file or folder; got an empty list")
     return files
 
 
-def _expand(path: Path, supported: Collection[str]) -> list[Path]:
+def _expand(
+    path: Path, supported: Collection[str], kind_of_folder: Callable[[Path], str | None]
+) -> list[Path]:
     """One file as it is, or the scan files of a folder."""
     if not path.exists():
         raise FileNotFoundError(f"path must name a file or folder; there is no {path}")
     if path.is_dir():
-        return _scans_in(path, supported)
+        return [path] if kind_of_folder(path) else _scans_in(path, supported)
     if path.suffix.lower() not in supported:
         raise ValueError(
             f"path must end in one of {' '.join(sorted(supported))}; got {path}. "

@@ -2,8 +2,9 @@
 
 The points of a PCD file are taken to be in the world frame already: VIEWPOINT gives the origin of
 the rays and moves nothing. That is how the published scans with a pose in each header are written
-(la3dm), and what the format's own text asks for: a viewpoint, not a transform. The header cannot
-say which beams met nothing; a field ``is_return`` can.
+(la3dm), and what the format's own text asks for: a viewpoint, not a transform. Where points are
+still in the sensor's frame, ``load_scans(path, frame="sensor")`` moves them by VIEWPOINT. The
+header cannot say which beams met nothing; a field ``is_return`` can.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lardhm_torch.io.readout import COLUMN_NAMES, Readout, readout_from_columns
 from lardhm_torch.io.records import (
@@ -26,6 +28,7 @@ from lardhm_torch.io.records import (
     read_binary,
     record_size,
 )
+from lardhm_torch.io.trajectories import poses_from_quaternions
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _ENTRIES = frozenset(
@@ -64,8 +67,17 @@ def read_pcd(path: Path) -> Readout:
     return replace(
         readout,
         origins=np.tile(position, (readout.num_scans, 1)),
+        world_from_sensor=_pose(header.viewpoint),
         origin_is_placeholder=header.viewpoint == _NO_VIEWPOINT,
     )
+
+
+def _pose(viewpoint: list[float]) -> NDArray[np.float64] | None:
+    """(4, 4) world_from_sensor; None where the header gives none, or no rotation."""
+    if viewpoint == _NO_VIEWPOINT or not any(viewpoint[3:]):
+        return None
+    position, (w, x, y, z) = viewpoint[:3], viewpoint[3:]
+    return poses_from_quaternions(np.array([position]), np.array([[x, y, z, w]]))[0]
 
 
 def _read_header(file: BinaryIO) -> _Header:

@@ -23,6 +23,7 @@ class Readout:
         scan_id: (R,) int64 index into origins.
         is_return: (R,) bool.
         target_index: (R,) int64, 1 = first return of a pulse.
+        world_from_sensor: (4, 4) pose the file carries, which has not moved its points.
         origin_is_placeholder: origins is what writers put when they know no pose.
         origin_cure: how a file of this format can carry its sensor position.
     """
@@ -32,6 +33,7 @@ class Readout:
     scan_id: NDArray[np.int64] | None = None
     is_return: NDArray[np.bool_] | None = None
     target_index: NDArray[np.int64] | None = None
+    world_from_sensor: NDArray[np.float64] | None = None
     origin_is_placeholder: bool = False
     origin_cure: str = "Add columns ox oy oz"
 

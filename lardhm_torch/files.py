@@ -1,0 +1,44 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replaced_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A new file beside path, which takes path's name at the end of the block, in one step.
+
+    After a failure or a kill the old file is still there, whole. Who has it open keeps its
+    content. Through a link, what it points to is replaced and the link stays.
+
+        with replaced_file("map.pt") as partial:
+            torch.save(state, partial)
+
+    Yields:
+        A path of the same folder and extension, to an empty file.
+
+    Raises:
+        FileNotFoundError: the folder of path does not exist.
+        IsADirectoryError: path is a folder.
+    """
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise FileNotFoundError(
+            f"path must be in a folder that exists; there is no {target.parent}"
+        )
+    if target.is_dir():
+        raise IsADirectoryError(f"path must be a file to write; {target} is a folder")
+    partial = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
+    os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # as the umask allows
+    try:
+        yield partial
+        with open(partial, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)

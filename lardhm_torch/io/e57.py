@@ -1,0 +1,141 @@
+"""E57 through pye57 (extra "io"): scans with their poses, cartesian or spherical."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lardhm_torch.io.readout import Readout, whole_numbers
+from lardhm_torch.io.trajectories import move_points, poses_from_quaternions
+
+_PAGE = 1024  # bytes, the last four of which are a checksum
+_LEAST_BYTES = 2  # of a record: three coordinates take more, and all-equal ones are no scan
+_RECORDS_AT_A_TIME = 1 << 16
+_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_IDENTITY = np.eye(4)
+
+
+def read_e57(path: Path) -> Readout:
+    """One scan for each entry of data3D that has points, moved by its pose, which is its origin.
+
+    Points that the scanner marked invalid are left out. A field returnIndex gives target_index. A
+    pose that moves nothing is what writers put when they know none: an origin given goes before it.
+
+    Raises:
+        ImportError: pye57 is not installed.
+        ValueError: the file is damaged or cut short, or has no points.
+
+    Source: ASTM E2807-11; http://www.libe57.org/.
+    """
+    _check_before_opening(path)
+    try:
+        import pye57
+    except ImportError as error:
+        raise ImportError(
+            f"{path} needs pye57. Install it: pip install 'lardhm_torch[io]'"
+        ) from error
+    ends, targets, poses = [], [], []
+    with pye57.E57(str(path)) as file:
+        for number in range(file.scan_count):
+            header = file.get_header(number)
+            columns = _read_columns(file, header, path.stat().st_size)
+            points = _points_of(columns)
+            if len(points):
+                poses.append(_pose_of(header))
+                ends.append(points if poses[-1] is None else move_points(poses[-1], points))
+                targets.append(columns.get("returnIndex", np.zeros(len(points))))
+    if not ends:
+        raise ValueError("at least one point is needed; got none")
+    has_pose = any(pose is not None for pose in poses)
+    filled = np.stack([_IDENTITY if pose is None else pose for pose in poses])
+    return Readout(
+        np.concatenate(ends),
+        filled[:, :3, 3] if has_pose else None,
+        np.repeat(np.arange(len(ends)), [len(points) for points in ends]),
+        target_index=whole_numbers(np.concatenate(targets), "returnIndex", 0, 255) + 1,
+        origin_is_placeholder=bool((filled == _IDENTITY).all()),
+        origin_cure="Export the scans with their poses",
+    )
+
+
+def _check_before_opening(path: Path) -> None:
+    """Hold the header against the file, and refuse XML that can unfold to any size."""
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        header = file.read(48).ljust(48, b"\0")
+        signature, _, length, xml_at, xml_size, page = struct.unpack("<8s8s4Q", header)
+        if signature != b"ASTM-E57" or page != _PAGE:
+            raise ValueError(f"an E57 file begins with ASTM-E57; got {header[:8]!r}")
+        pages = xml_size // (_PAGE - 4) + 2
+        if length != size or size % _PAGE or not 48 <= xml_at <= xml_at + xml_size <= size:
+            raise ValueError(
+                f"{length} bytes in pages of {_PAGE} are promised, XML of {xml_size} bytes at "
+                f"{xml_at}; got {size} bytes"
+            )
+        file.seek(xml_at - xml_at % _PAGE)
+        content = file.read(pages * _PAGE)
+    logical = b"".join(content[i : i + _PAGE - 4] for i in range(0, len(content), _PAGE))
+    xml = logical[xml_at % _PAGE :][:xml_size]
+    if not xml.startswith(b"<?xml") or b"<!DOCTYPE" in xml or b"<!ENTITY" in xml:
+        raise ValueError("the XML part must begin with <?xml and define no entities")
+
+
+def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.float64]]:
+    """The fields of a scan that are needed, a piece at a time."""
+    from pye57 import libe57
+
+    names = next((n for n in (_CARTESIAN, _SPHERICAL) if set(n) <= set(header.point_fields)), None)
+    count = header.point_count
+    if names is None:
+        raise ValueError(f"coordinates are needed; got {', '.join(header.point_fields)}")
+    if count * _LEAST_BYTES > size:
+        raise ValueError(f"{count} points are promised; {size} bytes are too few")
+    state = names[0].removesuffix("X").removesuffix("Range") + "InvalidState"
+    wanted = [*names, *(n for n in (state, "returnIndex") if n in header.point_fields)]
+    capacity = min(count, _RECORDS_AT_A_TIME)
+    piece = {name: np.empty(capacity) for name in wanted}
+    if not count:
+        return piece
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, values in piece.items():
+        buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, capacity, True, True))
+    reader, pieces, left = header.points.reader(buffers), [], count
+    while left > 0 and (got := reader.read()):
+        pieces.append({name: values[:got].copy() for name, values in piece.items()})
+        left -= got
+    reader.close()
+    if left:
+        raise ValueError(f"{count} points are promised; got {count - left}")
+    columns = {name: np.concatenate([part[name] for part in pieces]) for name in wanted}
+    is_valid = columns.pop(state, np.zeros(count)) == 0
+    return {name: values[is_valid] for name, values in columns.items()}
+
+
+def _points_of(columns: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """(n, 3) cartesian points, scanner frame [m]; angles of spherical ones are in radians."""
+    if _CARTESIAN[0] in columns:
+        return np.stack([columns[name] for name in _CARTESIAN], axis=1)
+    ranges, azimuth, elevation = (columns[name] for name in _SPHERICAL)
+    flat = ranges * np.cos(elevation)
+    return np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)], axis=1
+    )
+
+
+def _pose_of(header: Any) -> NDArray[np.float64] | None:
+    """(4, 4) world_from_scanner; None if the scan says nothing. Parts left out move nothing."""
+    if not header.has_pose():
+        return None
+    node = header.node["pose"]
+    turn, shift = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    if node.isDefined("rotation"):
+        turn = [node["rotation"][axis].value() for axis in "wxyz"]
+    if node.isDefined("translation"):
+        shift = [node["translation"][axis].value() for axis in "xyz"]
+    quaternion = np.array([[*turn[1:], turn[0]]])
+    return poses_from_quaternions(np.array([shift]), quaternion)[0]

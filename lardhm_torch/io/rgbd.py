@@ -1,0 +1,219 @@
+"""Folders of depth images from a moving camera: the 7-Scenes and the TUM layout."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lardhm_torch.io.paths import natural_key
+from lardhm_torch.io.poses import find_beside, read_poses
+from lardhm_torch.io.readout import Readout
+from lardhm_torch.io.records import read_table
+from lardhm_torch.io.trajectories import MAX_STAMP_GAP, Trajectory, check_rigid, move_points
+
+_INTRINSICS_FILES = ("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt")
+_MAX_PIXELS = 1 << 25
+_NO_DEPTH = (0, 65535)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """What a folder of depth images may not say.
+
+    Args:
+        intrinsics: fx, fy, cx, cy of the pinhole [pixels], lens distortion removed; None: a file
+            camera-intrinsics.txt beside the images.
+        pixel_step: every how many pixels of a row and of a column are read; 1: all of them.
+    """
+
+    intrinsics: tuple[float, float, float, float] | None = None
+    pixel_step: int = 4
+
+    def __post_init__(self) -> None:
+        if self.intrinsics is not None:
+            _check_intrinsics(tuple(self.intrinsics), "intrinsics")
+        if not isinstance(self.pixel_step, int) or self.pixel_step < 1:
+            raise ValueError(f"pixel_step must be 1 pixel or more; got {self.pixel_step!r}")
+
+
+@dataclass(frozen=True)
+class _Frame:
+    image: Path
+    pose: NDArray[np.float64]  # (4, 4) world_from_camera
+
+
+def is_rgbd_folder(folder: Path) -> bool:
+    """Whether a folder has depth images in a layout that is known."""
+    if (folder / "depth.txt").is_file():
+        return True
+    return any(file.name.endswith(".depth.png") for file in folder.iterdir())
+
+
+def read_rgbd(folder: Path, camera: Camera) -> Readout:
+    """One scan an image: every pixel with a depth is a ray end, the camera is the origin.
+
+    | layout | images | depth | poses, camera to world |
+    |---|---|---|---|
+    | 7-Scenes | frame-000000.depth.png | mm | frame-000000.pose.txt, 4 x 4 |
+    | TUM | as depth.txt lists them, with stamps | 1/5000 m | groundtruth.txt |
+
+    A pixel of depth 0 or 65535 has none. Images without a pose are left out, with a warning.
+
+    Raises:
+        ImportError: pillow is not installed.
+        ValueError: an image, a pose or the intrinsics cannot be read, or no image has a pose.
+    """
+    is_tum = (folder / "depth.txt").is_file()
+    frames, without_pose = _tum_frames(folder) if is_tum else _seven_scenes_frames(folder)
+    if not frames:
+        raise ValueError(f"an image with a pose is needed; got {without_pose} without")
+    if without_pose:
+        warnings.warn(
+            f"{folder}: {without_pose} depth images have no pose and are left out", stacklevel=2
+        )
+    intrinsics = camera.intrinsics or _read_intrinsics(folder)
+    ends, counts = [], []
+    for frame in frames:
+        points = _image_points(frame.image, intrinsics, 5000 if is_tum else 1000, camera.pixel_step)
+        ends.append(move_points(frame.pose, points))
+        counts.append(len(points))
+    if not any(counts):
+        raise ValueError("at least one pixel with a depth is needed; got none")
+    return Readout(
+        np.concatenate(ends),
+        origins=np.stack([frame.pose[:3, 3] for frame in frames]),
+        scan_id=np.repeat(np.arange(len(frames)), counts),
+    )
+
+
+def _seven_scenes_frames(folder: Path) -> tuple[list[_Frame], int]:
+    """The images in natural order, and how many have a pose that is not finite (tracking lost)."""
+    images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
+    frames = []
+    for image in images:
+        source = image.with_name(image.name.removesuffix(".depth.png") + ".pose.txt")
+        if not source.is_file():
+            raise ValueError(
+                f"{image.name} must have its pose beside it; there is no {source.name}"
+            )
+        try:
+            pose = read_table(source, 0, [0, 1, 2, 3])
+        except ValueError as error:
+            raise ValueError(f"{source.name} must hold 4 x 4 numbers: {error}") from error
+        if pose.shape != (4, 4):
+            raise ValueError(f"{source.name} must hold 4 x 4 numbers; got {pose.shape}")
+        if np.isfinite(pose).all():
+            check_rigid(pose[None], source.name)
+            frames.append(_Frame(image, pose))
+    return frames, len(images) - len(frames)
+
+
+def _tum_frames(folder: Path) -> tuple[list[_Frame], int]:
+    """The images that depth.txt lists, and how many are too far in time from a pose."""
+    stamps, images = [], []
+    for line in (folder / "depth.txt").read_text(encoding="latin-1").splitlines():
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        if len(words) != 2 or not _is_stamp(words[0]) or not _is_inside(words[1]):
+            raise ValueError(f"depth.txt must have a stamp and a file in each line; got {line!r}")
+        stamps.append(float(words[0]))
+        images.append(folder / words[1])
+    source = find_beside(folder / "depth.txt", ("groundtruth.txt",))
+    poses = None if source is None else read_poses(source)
+    if not isinstance(poses, Trajectory) or not len(poses.stamps):
+        raise ValueError(
+            "poses are needed beside depth.txt: groundtruth.txt, stamp tx ty tz qx qy qz qw a line"
+        )
+    found, gaps = poses.at(np.array(stamps))
+    frames = [
+        _Frame(image, pose)
+        for image, pose, gap in zip(images, found, gaps, strict=True)
+        if gap <= MAX_STAMP_GAP
+    ]
+    return frames, len(images) - len(frames)
+
+
+def _is_stamp(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
+def _is_inside(name: str) -> bool:
+    """Whether a listed file stays in the folder."""
+    return not Path(name).is_absolute() and ".." not in Path(name).parts
+
+
+def _read_intrinsics(folder: Path) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy from a 3 x 3 (or 4 x 4) matrix or a line of four numbers and more."""
+    source = find_beside(folder / "images", _INTRINSICS_FILES)
+    if source is None:
+        raise ValueError(
+            f"the camera is not known: put {_INTRINSICS_FILES[0]} (3 x 3) beside the images or give "
+            "it: load_scans(path, camera=Camera(intrinsics=(fx, fy, cx, cy))), "
+            "--camera FX,FY,CX,CY on the command line"
+        )
+    lines = source.read_text(encoding="latin-1").splitlines()
+    rows = [line.partition("#")[0].replace(",", " ").split() for line in lines]
+    rows = [row for row in rows if row]
+    try:
+        if len(rows) == 1:
+            values = tuple(map(float, rows[0][:4]))
+        else:
+            values = tuple(float(rows[i][j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    except (ValueError, IndexError):
+        values = ()
+    return _check_intrinsics(values, source.name)
+
+
+def _check_intrinsics(values: tuple[Any, ...], name: str) -> tuple[float, float, float, float]:
+    if len(values) != 4 or not all(map(math.isfinite, values)) or min(values[:2]) <= 0:
+        raise ValueError(f"{name} must give fx, fy > 0 and cx, cy [pixels]; got {values}")
+    fx, fy, cx, cy = values
+    return fx, fy, cx, cy
+
+
+def _image_points(
+    path: Path, intrinsics: tuple[float, float, float, float], per_meter: int, pixel_step: int
+) -> NDArray[np.float64]:
+    """(n, 3) points of the pixels with a depth, camera frame: x right, y down, z ahead [m]."""
+    depth = _read_depth(path)[::pixel_step, ::pixel_step]
+    rows, columns = np.nonzero((depth != _NO_DEPTH[0]) & (depth != _NO_DEPTH[1]))
+    fx, fy, cx, cy = intrinsics
+    ahead = depth[rows, columns] / per_meter
+    right = (columns * pixel_step - cx) / fx * ahead
+    down = (rows * pixel_step - cy) / fy * ahead
+    return np.stack([right, down, ahead], axis=1)
+
+
+def _read_depth(path: Path) -> NDArray[np.float64]:
+    """(height, width) stored depths of a 16-bit PNG."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(
+            f"{path} needs pillow. Install it: pip install 'lardhm_torch[io]'"
+        ) from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(path, formats=["PNG"])
+        with image:
+            if image.width * image.height > _MAX_PIXELS or not image.mode.startswith("I"):
+                raise ValueError(
+                    f"16 bits a pixel and at most {_MAX_PIXELS} pixels are needed; "
+                    f"got mode {image.mode}, {image.width} x {image.height}"
+                )
+            return np.asarray(image).astype(np.float64)
+    except FileNotFoundError:
+        raise ValueError(f"depth image {path} is missing") from None
+    except Exception as error:
+        raise ValueError(f"depth image {path.name} cannot be read: {error}") from error
