@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lardhm_torch import checkpoint, native
+from lardhm_torch import checkpoint, native, uncertainty
 from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, fit_weights, training_order
@@ -35,6 +35,8 @@ class LardHilbertMap(nn.Module):
         raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with the logarithm of their
             diagonals: any value is a valid factor. `scale_tril` is the kernel's.
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters.
+        posterior_means, posterior_variances: (M,) buffers, the weights as `fit_uncertainty` knows
+            them; 0 for clusters that it has not seen.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
@@ -47,6 +49,8 @@ class LardHilbertMap(nn.Module):
     counts: Tensor
     means: Tensor
     scatters: Tensor
+    posterior_means: Tensor
+    posterior_variances: Tensor
     origin: Tensor
 
     def __init__(
@@ -77,6 +81,9 @@ class LardHilbertMap(nn.Module):
         self.register_buffer("counts", torch.zeros(0, dtype=torch.long))
         self.register_buffer("means", torch.zeros(0, dim))
         self.register_buffer("scatters", torch.zeros(0, dim, dim))
+        self.register_buffer("posterior_means", torch.zeros(0))
+        self.register_buffer("posterior_variances", torch.zeros(0))
+        self.register_load_state_dict_pre_hook(uncertainty.fill_missing)
         self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
         self._index = torch.empty(0, dtype=torch.uint8)
         self.register_load_state_dict_pre_hook(_make_room)
@@ -124,6 +131,45 @@ class LardHilbertMap(nn.Module):
         )
         values = lard_kernel(local, self.centers, self.scale_tril, indices)
         return feature_matrix(indices, values, len(self))
+
+    def variance(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) variance of the log-odds; the prior's where unseen.
+
+        Raises:
+            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
+        """
+        return self._posterior(points)[1]
+
+    def bayesian_probability(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) probability of occupancy, unsure where weights are.
+
+        Raises:
+            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
+        """
+        return uncertainty.moderate(*self._posterior(points))
+
+    def _posterior(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the log-odds at (..., D) points."""
+        if not bool((self.posterior_variances > 0).all()) or len(self) == 0:
+            raise RuntimeError(
+                "variance needs the posterior of every weight; "
+                "call fit_uncertainty(points, labels) first, and again after update"
+            )
+        local = self._to_map_frame(points)
+        parts = []
+        for chunk in local.reshape(-1, self.dim).split(uncertainty.QUERY_CHUNK):
+            indices, values = self._nearest_features(chunk)
+            mean = (values * self.posterior_means[indices]).sum(dim=1)
+            variance = uncertainty.latent_variance(indices, values, self.posterior_variances)
+            parts.append(torch.stack([mean, variance]))
+        mean, variance = torch.cat(parts, dim=1).reshape(2, *local.shape[:-1])
+        return mean, variance
+
+    def _nearest_features(self, local: Tensor) -> tuple[Tensor, Tensor]:
+        centers, raw_scale_tril = self.centers.detach(), self.raw_scale_tril.detach()
+        return native.nearest_features(
+            local, centers, raw_scale_tril, self.kernel, self._fresh_index()
+        )
 
     def _query(self, points: Tensor, probability: bool) -> Tensor:
         local = self._to_map_frame(points)
@@ -218,6 +264,36 @@ class LardHilbertMap(nn.Module):
         learned._grow(clusters, is_occupied, origin)
         learned._train_weights(local, labels, config or FitConfig(), rng, progress)
         self.load_state_dict(learned.state_dict())
+        return self
+
+    @torch.no_grad()
+    def fit_uncertainty(self, points: Tensor, labels: Tensor) -> LardHilbertMap:
+        """Learn how sure the weights are; `variance` and `bayesian_probability` then answer.
+
+        The map's own probability and log-odds stay as they are, and as fast. Call it after the
+        last `fit`, `fine_tune` or `update`, with the points the map was made from: the posterior
+        belongs to the weights it was made for.
+
+        Args:
+            points: (N, D) world positions [m].
+            labels: (N,) 1 occupied, 0 free.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: the map is empty, or the samples are bad (see `fit`).
+        """
+        if len(self) == 0:
+            raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
+        points, labels = check_samples(points, labels, self.dim, self.origin.device)
+        indices, values = self._nearest_features(self._to_map_frame(points))
+        log_odds = (values * self.weights[indices]).sum(dim=1)
+        variances = uncertainty.weight_variances(indices, values, log_odds, len(self))
+        samples = (indices, values, log_odds, labels.to(values.dtype))
+        scale = uncertainty.posterior_scale(*samples, variances)
+        self.posterior_means = scale * self.weights.detach()
+        self.posterior_variances = variances
         return self
 
     def _train_weights(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BLOCK_CELLS = 24  # cells along a block's edge
 CHUNK_VERTICES = 1 << 18  # vertices probed at a time
 PROBES = (1.0, 2.0, 3.0)  # standard deviations before and behind a face where evidence is sought
-COLORS = ("height", "cluster", "probability")
+COLORS = ("height", "cluster", "probability", "variance")
 
 
 def extract_mesh(
@@ -217,8 +217,17 @@ def _vertex_colors(
         with torch.no_grad():
             at_centers = model(model.centers.double() + model.origin).cpu().numpy()
         return colormaps["viridis"](2 * at_centers[nearest] - 1, bytes=True)
-    low, high = np.quantile(world[:, 2], [0.01, 0.99])  # a few stray faces shall not set the scale
-    return colormaps["viridis"]((world[:, 2] - low) / max(high - low, 1e-9), bytes=True)
+    if color == "variance":
+        places = torch.as_tensor(world, device=model.origin.device)
+        variance = torch.cat([model.variance(part) for part in places.split(CHUNK_VERTICES)])
+        return colormaps["plasma"](_stretch(variance.double().cpu().numpy()), bytes=True)
+    return colormaps["viridis"](_stretch(world[:, 2]), bytes=True)
+
+
+def _stretch(values: np.ndarray) -> np.ndarray:
+    """Values to colors' [0, 1]; a few stray faces shall not set the scale."""
+    low, high = np.quantile(values, [0.01, 0.99])
+    return (values - low) / max(high - low, 1e-9)
 
 
 def _to_mesh(

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from torch import nn
 
-from lardhm_torch import meshing
+from lardhm_torch import LardHilbertMap, meshing
 from lardhm_torch.meshing import extract_mesh
 
 
@@ -177,6 +177,21 @@ def test_colors_by_cluster_and_by_probability_are_those_of_the_nearest_cluster()
         assert (shades[0] != shades[1]).any()
 
 
+def test_colors_by_variance_are_dark_where_the_map_is_sure():
+    rng = torch.Generator().manual_seed(0)
+    points = torch.rand(1600, 3, generator=rng, dtype=torch.float64)
+    points[:800, 0] = 1 + 0.02 * torch.randn(800, generator=rng, dtype=torch.float64)
+    points[800:, 0] *= 0.8
+    labels = (torch.arange(1600) < 800).float()
+    model = LardHilbertMap().fit(points, labels).fit_uncertainty(points, labels)
+    mesh = extract_mesh(model, 0.05, color="variance", evidence=None)
+    variance = model.variance(torch.as_tensor(np.array(mesh.vertices))).numpy()
+    brightness = np.asarray(mesh.visual.vertex_colors)[:, :3].sum(axis=1)
+    low, high = np.quantile(variance, [0.2, 0.8])
+    assert low < high
+    assert brightness[variance >= high].min() > brightness[variance <= low].max()
+
+
 def test_without_color_the_mesh_has_none():
     assert extract_mesh(ball_in_free_space(), 0.1, color=None).visual.kind is None
 
@@ -192,7 +207,7 @@ def test_without_color_the_mesh_has_none():
         ({"resolution": 0.0}, "resolution must be > 0 m and finite; got 0.0"),
         ({"resolution": math.nan}, "resolution must be > 0 m and finite; got nan"),
         ({"threshold": 0.0}, "threshold must be between 0 and 1, both excluded; got 0.0"),
-        ({"color": "pink"}, "color must be one of height, cluster, probability, or None"),
+        ({"color": "pink"}, "color must be one of height, cluster, probability, variance, or None"),
         ({"evidence": -1.0}, "evidence must be >= 0, or None"),
         ({"bounds": ([1, 1, 1], [0, 0, 0])}, "lower <= upper"),
         ({"bounds": ([0, 0], [1, 1])}, r"bounds must have 3 coordinates; got 2"),
