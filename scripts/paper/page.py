@@ -206,7 +206,7 @@ def _figure_one(result: dict[str, Any]) -> str:
         f"## Fig. 1: the rings ({result['points']} points, {result['clusters']} clusters)\n\n"
         "![points, clusters with ellipses, k = 1, k = 5, no LARD](figure_1.png)\n\n"
         f"Training points on the right side of 1/2: {scores}. As in the paper, k = 1 gives jagged borders, k = 5 "
-        "smooth ones, and round kernels of one size spread over the gaps between the rings."
+        "smooth ones, and round kernels of one size for all spread over the gaps inside the rings, where no data are."
     )
 
 
