@@ -47,7 +47,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     results = page.load_results(folder)
     seconds = results.get("conditions", {}).get("seconds", {})
-    results["conditions"] = {**conditions(), "seconds": seconds}
+    results["conditions"] = {**conditions(), "seconds": seconds, "note": arguments.note}
     for number, name in enumerate(arguments.only, start=1):
         print(f"[{number}/{len(arguments.only)}] {name}", flush=True)
         start = time.perf_counter()
@@ -84,6 +84,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/paper"))
+    parser.add_argument("--note", default="", help="a sentence on how it was run, for the page")
     parser.add_argument(
         "--only", nargs="+", choices=list(EXPERIMENTS), default=list(EXPERIMENTS), metavar="NAME",
         help=f"of {', '.join(EXPERIMENTS)}",

@@ -87,7 +87,7 @@ def _conditions(result: dict[str, Any]) -> str:
     return (
         f"Measured on {result['processor']}, {result['threads']} thread(s), load "
         f"{result['load']:.1f} at the start; {versions}; all experiments together {seconds / 60:.0f} "
-        "minutes. On a loaded machine read ratios, not milliseconds."
+        f"minutes. {result['note']} On a loaded machine read ratios, not milliseconds."
     )
 
 
