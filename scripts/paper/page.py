@@ -218,7 +218,7 @@ def _figure_two(result: dict[str, Any]) -> str:
 | ![OctoMap](figure_2_octomap.png) | ![Original HM](figure_2_original_hm.png) | ![Local GP](figure_2_local_gp.png) | ![LARD-HM](figure_2_lard_hm.png) |
 | | | colored by its variance: ![variance of Local GP](figure_2_local_gp_variance.png) | colored by its variance: ![variance of LARD-HM](figure_2_lard_hm_variance.png) |
 
-Level 1/2 on the Table II grid; LARD-HM through `extract_mesh`, which drops faces that no data support. The second row is
+Level 1/2 on the Table II grid; LARD-HM through `extract_mesh`, which drops faces that no data support (the second row keeps them). The second row is
 the paper's Fig. 2f (dark: sure, yellow: unsure), and the same for LARD-HM, which the paper did not explore."""
 
 
