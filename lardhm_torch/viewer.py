@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.meshing import COLORS, lattice_mesh, surface_lattice
-from lardhm_torch.querying import map_bounds, query_slice
+from lardhm_torch.querying import query_slice
 from lardhm_torch.scans import Scans
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ class MapViewer:
         self.config = config or ViewConfig()
         _check_model(model)
         self.server = _new_server(self.config)
-        lower, upper = map_bounds(model)
-        self.offset = ((lower + upper) / 2).round().cpu().numpy()
+        self._core = _core(model)
+        self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
         self._model = _snapshot(model)
         self._mesh: Any = None
         self._lattice: Any = None
@@ -144,7 +144,7 @@ class MapViewer:
             self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5)
             colors = [*COLORS, *(["variance"] if hasattr(self._model, "variance") else [])]
             self._color = gui.add_dropdown("color", colors, initial_value="height")
-        lower, upper = (end.cpu().numpy() - self.offset for end in map_bounds(self._model))
+        lower, upper = (end.numpy() - self.offset for end in self._core)
         with gui.add_folder("Slice"):
             self._show_slice = gui.add_checkbox("show slice", False)
             self._height = gui.add_slider(
@@ -177,14 +177,13 @@ class MapViewer:
                 if self._closed:
                     return
                 job = next(name for name in LATEST_WINS if name in self._wanted)
-                asked, self._wanted = self._wanted, {"busy"}
+                self._wanted = {"busy"}  # one drawing answers all that was asked for until now
                 model = self._model
             try:
                 self._status.content = "*drawing ...*"
                 self._draw(model, job)
             except Exception as error:
                 self._status.content = f"**{type(error).__name__}**: {error}"
-            del asked
             with self._changed:
                 self._wanted.discard("busy")
                 self._changed.notify_all()
@@ -234,11 +233,10 @@ class MapViewer:
         if not self._show_slice.value:
             scene.remove_by_name("/slice")
             return
-        lower, upper = (end.cpu().numpy() for end in map_bounds(self._model))
-        size = upper[:2] - lower[:2]
+        pixel = float((self._core[1] - self._core[0])[:2].max()) / SLICE_PIXELS
         height = float(self._height.value)
         probability, extent = query_slice(
-            self._model, height + float(self.offset[2]), float(size.max()) / SLICE_PIXELS
+            self._model, height + float(self.offset[2]), pixel, self._core
         )
         p = probability.float().cpu().numpy().T[::-1]  # rows from the top, that is from large y
         image = colormaps["RdBu_r"](p, bytes=True)
@@ -290,7 +288,7 @@ class MapViewer:
             (centers.numpy() - self.offset).astype(np.float32),
             batched_scales=(stds / model.covariance_scale**0.5).numpy().astype(np.float32),
             batched_colors=color,
-            opacity=0.6,
+            opacity=0.9,
             cast_shadow=False,
             receive_shadow=False,
             visible=visible,
@@ -319,7 +317,7 @@ class MapViewer:
         )
         origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
         sensors = scene.add_point_cloud(
-            "/sensors", origins, (255, 150, 0), point_size=0.25, point_shape="circle"
+            "/sensors", origins, (255, 150, 0), point_size=0.12, point_shape="circle"
         )
 
         def apply(_: Any) -> None:
@@ -341,12 +339,11 @@ class MapViewer:
 
     def _aim_camera(self) -> None:
         """From obliquely above, far enough to see where most clusters are."""
-        centers = self._model.centers.detach().double().cpu() + self._model.origin.cpu()
-        low, high = np.quantile(centers.numpy() - self.offset, [0.05, 0.95], axis=0)
+        low, high = (end.numpy() - self.offset for end in self._core)
         reach = max(float(np.linalg.norm(high - low)), 1.0)
         camera = self.server.initial_camera
         camera.look_at = tuple((low + high) / 2)
-        camera.position = tuple((low + high) / 2 + reach * np.array([0.35, -0.65, 0.65]))
+        camera.position = tuple((low + high) / 2 + reach * np.array([0.25, -0.5, 0.5]))
         self.server.scene.set_up_direction("+z")
 
 
@@ -368,6 +365,14 @@ def _check_model(model: Any) -> None:
         raise ValueError("the map must hold clusters to be viewed; it is empty: fit it first")
 
 
+def _core(model: Any, share: float = 0.02, margin: float = 0.5) -> tuple[Tensor, Tensor]:
+    """(3,) and (3,) world corners around all but the outermost clusters [m]: what is worth a look."""
+    chosen = model.weights > 0
+    centers = model.centers[chosen if bool(chosen.any()) else ...].detach().double().cpu()
+    ends = torch.quantile(centers, torch.tensor([share, 1 - share], dtype=torch.float64), dim=0)
+    return ends[0] + model.origin.cpu() - margin, ends[1] + model.origin.cpu() + margin
+
+
 def _snapshot(model: Any) -> Any:
     """A copy that training on does not change."""
     return copy.deepcopy(model).requires_grad_(False)
@@ -383,7 +388,7 @@ def _view_resolution(model: Any) -> float:
         return 0.1
     stds = torch.linalg.svdvals(factors) / model.covariance_scale**0.5
     area = 8 * float((stds[:, 0] * stds[:, 1]).sum())
-    return max(0.01, (2 * area / MESH_FACES) ** 0.5)
+    return max(0.02, (4 * area / MESH_FACES) ** 0.5)
 
 
 def _variance_colors(model: Any, vertices: np.ndarray) -> np.ndarray:
