@@ -42,6 +42,9 @@ def grid(lower: Any, upper: Any, resolution: float, device: Any = None) -> Tenso
 
     Raises:
         ValueError: the corners are not finite, ordered and of one length, or resolution is not > 0.
+
+    >>> grid([0, 0], [1, 2], 0.5).shape
+    torch.Size([3, 5, 2])
     """
     axes = grid_axes(lower, upper, resolution, device)
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)

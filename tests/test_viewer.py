@@ -9,11 +9,17 @@ import torch
 from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, simulate_room, viewer
 from lardhm_torch.viewer import MapViewer, ViewConfig
 
-FLAGS = (
-    "--no-sandbox --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader"
-).split()
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 PATIENCE = 120_000  # [ms] a shared machine draws in software
 
 pytestmark = pytest.mark.skipif(
