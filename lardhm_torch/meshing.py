@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.features import nearest_centers
-from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, cluster_boxes, grid_axes
+from lardhm_torch.native import nearest_centers
+from lardhm_torch.querying import EVIDENCE, cluster_boxes, grid_axes, lattice_values
 
 if TYPE_CHECKING:
     import trimesh
@@ -174,21 +174,17 @@ def _block_values(
     """First cell (3,) and log-odds of every block, those inside the bounds."""
     from tqdm import tqdm
 
-    planes = torch.arange(BLOCK_CELLS + 1)
-    batches = blocks.split(max(1, BLOCK_POINTS // len(planes) ** 3))
-    for batch in tqdm(batches, desc="mesh", disable=None if progress else True):
-        first_cells = batch * BLOCK_CELLS  # (B, 3)
-        places = corner[:, None] + resolution * (first_cells[:, :, None] + planes)  # (B, 3, n)
-        points = torch.empty(len(batch), *[len(planes)] * 3, 3, dtype=torch.float64)
-        points[..., 0] = places[:, 0, :, None, None]
-        points[..., 1] = places[:, 1, None, :, None]
-        points[..., 2] = places[:, 2, None, None, :]
-        log_odds = model.log_odds(points.to(model.centers.device)).float().cpu().numpy()
-        counts = (cells - first_cells).clamp(
-            max=BLOCK_CELLS
-        ) + 1  # lattice planes inside the bounds
-        for first_cell, n, values in zip(first_cells, counts.tolist(), log_odds, strict=True):
-            yield first_cell, values[: n[0], : n[1], : n[2]]
+    device = model.centers.device
+    for block in tqdm(blocks, desc="mesh", disable=None if progress else True):
+        first_cell = block * BLOCK_CELLS
+        last_cell = (first_cell + BLOCK_CELLS).minimum(cells)
+        axes = [
+            (start + resolution * torch.arange(int(first), int(last) + 1, dtype=torch.float64)).to(
+                device
+            )
+            for start, first, last in zip(corner, first_cell, last_cell, strict=True)
+        ]
+        yield first_cell, lattice_values(model, axes, probability=False).float().cpu().numpy()
 
 
 def _march_blocks(

@@ -70,22 +70,33 @@ def grid_axes(lower: Any, upper: Any, resolution: float, device: Any = None) -> 
     ]
 
 
-@torch.no_grad()
 def query_grid(model: Any, lower: Any, upper: Any, resolution: float) -> Tensor:
     """Probability at all points of `grid`, without holding the points: (nx, ny, nz).
 
-    Evaluated a million points at a time; the result has the map's dtype and device.
+    The result has the map's dtype and device.
     """
     axes = grid_axes(lower, upper, resolution, model.centers.device)
     if len(axes) != model.dim:
         raise ValueError(f"lower and upper must have {model.dim} coordinates; got {len(axes)}")
+    return lattice_values(model, axes, probability=True)
+
+
+@torch.no_grad()
+def lattice_values(model: Any, axes: list[Tensor], *, probability: bool) -> Tensor:
+    """Probability, or log-odds, at all combinations of D lists of world coordinates [m].
+
+    By the map's own ``query_lattice``, where it has one; else a million points at a time.
+    """
+    if hasattr(model, "query_lattice"):
+        return model.query_lattice(axes, probability=probability)
+    answer = model if probability else model.log_odds
     shape = [len(axis) for axis in axes]
     result = model.centers.new_empty(math.prod(shape))
     for start in range(0, len(result), BLOCK_POINTS):
         stop = min(start + BLOCK_POINTS, len(result))
         index = torch.unravel_index(torch.arange(start, stop, device=result.device), shape)
         points = torch.stack([axis[i] for axis, i in zip(axes, index, strict=True)], dim=1)
-        result[start:stop] = model(points)
+        result[start:stop] = answer(points)
     return result.reshape(shape)
 
 

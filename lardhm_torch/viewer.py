@@ -14,19 +14,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from lardhm_torch.meshing import COLORS, lattice_mesh, surface_lattice
-from lardhm_torch.querying import query_slice
 from lardhm_torch.scans import Scans
+from lardhm_torch.scene import (
+    core_box,
+    ellipsoids,
+    scan_points,
+    slice_picture,
+    variance_colors,
+    view_resolution,
+)
 
 if TYPE_CHECKING:
     import trimesh
 
 EXPORT_SUFFIXES = (".html", ".viser")
-SLICE_PIXELS = 512  # along the longer edge
-MESH_FACES = 200_000  # about; the resolution is chosen for it
 OCCUPIED, FREE = (200, 70, 60), (70, 110, 190)  # colors of the clusters
 LATEST_WINS = ("map", "threshold", "color")  # what the worker does, in this order
 
@@ -68,7 +72,7 @@ class MapViewer:
         self.config = config or ViewConfig()
         _check_model(model)
         self.server = _new_server(self.config)
-        self._core = _core(model)
+        self._core = core_box(model)
         self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
         self._model = _snapshot(model)
         self._mesh: Any = None
@@ -190,7 +194,7 @@ class MapViewer:
 
     def _draw(self, model: Any, job: str) -> None:
         if job == "map":
-            resolution = self.config.resolution or _view_resolution(model)
+            resolution = self.config.resolution or view_resolution(model)
             self._lattice = surface_lattice(model, resolution, keep=True)
             self._draw_clusters(model)
             self._draw_slice()
@@ -206,7 +210,7 @@ class MapViewer:
             mesh = self._mesh = lattice_mesh(model, self._lattice, threshold, color=color)
             self._drawn_color = color
         if color == "variance" and len(mesh.vertices):
-            mesh.visual.vertex_colors = _variance_colors(model, np.asarray(mesh.vertices))
+            mesh.visual.vertex_colors = variance_colors(model, np.asarray(mesh.vertices))
             self._drawn_color = "variance"
         self._send_mesh(mesh)
         self._status.content = (
@@ -227,35 +231,13 @@ class MapViewer:
         scene.add_mesh_trimesh("/surface", moved, visible=self._show_mesh.value, cast_shadow=False)
 
     def _draw_slice(self) -> None:
-        from matplotlib import colormaps
-
         scene = self.server.scene
         if not self._show_slice.value:
             scene.remove_by_name("/slice")
             return
-        pixel = float((self._core[1] - self._core[0])[:2].max()) / SLICE_PIXELS
         height = float(self._height.value)
-        probability, extent = query_slice(
-            self._model, height + float(self.offset[2]), pixel, self._core
-        )
-        p = probability.float().cpu().numpy().T[::-1]  # rows from the top, that is from large y
-        image = colormaps["RdBu_r"](p, bytes=True)
-        image[..., 3] = np.clip(np.abs(p - 0.5) * 1000, 40, 235)  # the unknown is nearly clear
-        scene.add_image(
-            "/slice",
-            image,
-            extent[1] - extent[0],
-            extent[3] - extent[2],
-            format="png",
-            wxyz=(0.0, 1.0, 0.0, 0.0),  # image rows go down: turned about x, they go along -y
-            position=(
-                (extent[0] + extent[1]) / 2 - self.offset[0],
-                (extent[2] + extent[3]) / 2 - self.offset[1],
-                height,
-            ),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        picture = slice_picture(self._model, height, self._core, self.offset)
+        scene.add_image("/slice", **picture, cast_shadow=False, receive_shadow=False)
 
     def _draw_clusters(self, model: Any) -> None:
         weights = model.weights.detach()
@@ -273,20 +255,9 @@ class MapViewer:
     def _send_ellipsoids(
         self, model: Any, name: str, color: tuple[int, int, int], chosen: Tensor, visible: bool
     ) -> None:
-        import trimesh
-
-        ball = trimesh.creation.icosphere(subdivisions=1)
-        factors = model.scale_tril.detach()[chosen].double().cpu()
-        axes, stds, _ = torch.linalg.svd(factors)
-        axes[torch.linalg.det(axes) < 0, :, 2] *= -1
-        centers = model.centers.detach()[chosen].double().cpu() + model.origin.cpu()
         self.server.scene.add_batched_meshes_simple(
             name,
-            ball.vertices,
-            ball.faces,
-            _quaternions(axes.numpy()),
-            (centers.numpy() - self.offset).astype(np.float32),
-            batched_scales=(stds / model.covariance_scale**0.5).numpy().astype(np.float32),
+            **ellipsoids(model, chosen, self.offset),
             batched_colors=color,
             opacity=0.9,
             cast_shadow=False,
@@ -295,25 +266,14 @@ class MapViewer:
         )
 
     def _add_scans(self, scans: Scans) -> None:
-        from matplotlib import colormaps
-
-        hits = scans.hits
-        hits = hits[hits.isfinite().all(dim=1)].cpu()
-        if len(hits) > self.config.max_points:
-            rng = torch.Generator().manual_seed(0)
-            hits = hits[torch.randperm(len(hits), generator=rng)[: self.config.max_points]]
-        points = (hits.numpy() - self.offset).astype(np.float32)
+        points, colors = scan_points(scans, self.config.max_points, self.offset)
         gui, scene = self.server.gui, self.server.scene
         with gui.add_folder("Scans"):
             self._show_scans = gui.add_checkbox("show points", True)
             self._show_origins = gui.add_checkbox("show sensors", True)
             size = gui.add_slider("point size [m]", 0.005, 0.1, 0.005, 0.02)
-        low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
-        colors = colormaps["gray"](
-            0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9), bytes=True
-        )
         cloud = scene.add_point_cloud(
-            "/scans", points, colors[:, :3], point_size=0.02, precision="float32"
+            "/scans", points, colors, point_size=0.02, precision="float32"
         )
         origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
         sensors = scene.add_point_cloud(
@@ -365,46 +325,6 @@ def _check_model(model: Any) -> None:
         raise ValueError("the map must hold clusters to be viewed; it is empty: fit it first")
 
 
-def _core(model: Any, share: float = 0.02, margin: float = 0.5) -> tuple[Tensor, Tensor]:
-    """(3,) and (3,) world corners around all but the outermost clusters [m]: what is worth a look."""
-    chosen = model.weights > 0
-    centers = model.centers[chosen if bool(chosen.any()) else ...].detach().double().cpu()
-    ends = torch.quantile(centers, torch.tensor([share, 1 - share], dtype=torch.float64), dim=0)
-    return ends[0] + model.origin.cpu() - margin, ends[1] + model.origin.cpu() + margin
-
-
 def _snapshot(model: Any) -> Any:
     """A copy that training on does not change."""
     return copy.deepcopy(model).requires_grad_(False)
-
-
-def _view_resolution(model: Any) -> float:
-    """Edge of a cell [m] at which the surface has about `MESH_FACES` faces.
-
-    The clusters lie on the surface like tiles of two standard deviations to each side.
-    """
-    factors = model.scale_tril.detach()[model.weights > 0].double()
-    if len(factors) == 0:
-        return 0.1
-    stds = torch.linalg.svdvals(factors) / model.covariance_scale**0.5
-    area = 8 * float((stds[:, 0] * stds[:, 1]).sum())
-    return max(0.02, (4 * area / MESH_FACES) ** 0.5)
-
-
-def _variance_colors(model: Any, vertices: np.ndarray) -> np.ndarray:
-    """(V, 4) RGBA: dark where the map is certain, bright where it is not."""
-    from matplotlib import colormaps
-
-    points = torch.as_tensor(vertices, device=model.centers.device)
-    with torch.no_grad():
-        variance = model.variance(points).double().cpu().numpy()
-    logs = np.log10(np.maximum(variance, 1e-12))
-    low, high = np.quantile(logs, [0.02, 0.98])
-    return colormaps["magma"]((logs - low) / max(high - low, 1e-9), bytes=True)
-
-
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) rotation matrices -> (N, 4) quaternions w, x, y, z."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]].astype(np.float32)

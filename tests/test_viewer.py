@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, simulate_room, viewer
+from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, scene, simulate_room
 from lardhm_torch.viewer import MapViewer, ViewConfig
 
 FLAGS = [
@@ -184,7 +184,7 @@ def test_a_flat_or_empty_map_is_refused():
 def test_ellipsoids_are_turned_as_their_clusters_are():
     rotation = torch.linalg.qr(torch.randn(4, 3, 3, dtype=torch.float64))[0]
     rotation[torch.linalg.det(rotation) < 0, :, 2] *= -1
-    w, x, y, z = viewer._quaternions(rotation.numpy()).T.astype(np.float64)
+    w, x, y, z = scene.quaternions(rotation.numpy()).T.astype(np.float64)
     first_column = np.stack(
         [1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1
     )
