@@ -78,7 +78,7 @@ def raycast(
     - ``surface="peak"`` goes on to the ridge: the largest log-odds before they fall by 1 again. That
       is where the hits lie, so it is the range that a sensor would measure.
     - ``surface="crossing"`` goes back to where log-odds last crossed the threshold, and bisects.
-      Free space is learned only up to some centimeters before the hits, so this lies 5 to 10 cm
+      Free space is learned only up to some centimeters before the hits, so this lies about 10 cm
       in front of the surface: on the safe side for a robot. A ray that starts clearly above the
       threshold gives 0; one that starts in between is met where it gets clearly above.
 

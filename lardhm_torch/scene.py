@@ -93,6 +93,17 @@ def scan_points(scans: Scans, most: int, offset: np.ndarray) -> tuple[np.ndarray
     return points, colormaps["gray"](shades, bytes=True)[:, :3]
 
 
+def knows_variance(model: Any) -> bool:
+    """Whether the map can tell how unsure it is: has ``variance``, and what that needs."""
+    if not hasattr(model, "variance"):
+        return False
+    try:
+        model.variance(model.centers[:1].detach().double() + model.origin)
+    except RuntimeError:
+        return False
+    return True
+
+
 def variance_colors(model: Any, vertices: np.ndarray) -> np.ndarray:
     """(V, 4) RGBA: dark where the map is certain, bright where it is not."""
     from matplotlib import colormaps

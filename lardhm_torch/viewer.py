@@ -21,6 +21,7 @@ from lardhm_torch.scans import Scans
 from lardhm_torch.scene import (
     core_box,
     ellipsoids,
+    knows_variance,
     scan_points,
     slice_picture,
     variance_colors,
@@ -146,7 +147,7 @@ class MapViewer:
         with gui.add_folder("Surface"):
             self._show_mesh = gui.add_checkbox("show surface", True)
             self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5)
-            colors = [*COLORS, *(["variance"] if hasattr(self._model, "variance") else [])]
+            colors = [*COLORS, *(["variance"] if knows_variance(self._model) else [])]
             self._color = gui.add_dropdown("color", colors, initial_value="height")
         lower, upper = (end.numpy() - self.offset for end in self._core)
         with gui.add_folder("Slice"):
@@ -305,6 +306,32 @@ class MapViewer:
         camera.look_at = tuple((low + high) / 2)
         camera.position = tuple((low + high) / 2 + reach * np.array([0.25, -0.5, 0.5]))
         self.server.scene.set_up_direction("+z")
+
+
+class LiveView:
+    """The page of a map that does not exist yet: opened by the first update, redrawn by each.
+
+    Args:
+        config: where to serve, and how much.
+    """
+
+    def __init__(self, config: ViewConfig | None = None) -> None:
+        self.config = config
+        self.viewer: MapViewer | None = None
+
+    def update(self, model: Any) -> None:
+        """Show this state of the map; an empty one is not shown yet."""
+        if len(model.centers) == 0:
+            return
+        if self.viewer is None:
+            self.viewer = MapViewer(model, config=self.config)
+        else:
+            self.viewer.update(model)
+
+    def close(self) -> None:
+        """Stop serving, if there was anything to serve."""
+        if self.viewer is not None:
+            self.viewer.close()
 
 
 def _new_server(config: ViewConfig) -> Any:

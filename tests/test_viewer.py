@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, scene, simulate_room
-from lardhm_torch.viewer import MapViewer, ViewConfig
+from lardhm_torch.viewer import LiveView, MapViewer, ViewConfig
 
 FLAGS = [
     "--no-sandbox",
@@ -179,6 +179,39 @@ def test_a_flat_or_empty_map_is_refused():
         MapViewer(LardHilbertMap(dim=2))
     with pytest.raises(ValueError, match="it is empty: fit it first"):
         MapViewer(LardHilbertMap())
+
+
+def test_the_page_of_a_map_to_come_opens_with_its_first_cluster(model):
+    live = LiveView(ViewConfig(resolution=0.3))
+    live.update(LardHilbertMap())
+    assert live.viewer is None
+    live.update(model)
+    live.update(model)
+    assert live.viewer.url.startswith("http://127.0.0.1:")
+    live.viewer.wait()
+    live.close()
+
+
+class UnsureMap(LardHilbertMap):
+    """Unsure in proportion to the height; or not yet, like a map without posterior."""
+
+    ready = True
+
+    def variance(self, points):
+        if not self.ready:
+            raise RuntimeError("no posterior")
+        return points[..., 2].clamp(min=0)
+
+
+def test_variance_is_offered_where_the_map_knows_it_and_colors_grow_with_it():
+    unsure = UnsureMap()
+    unsure.load_state_dict(LardHilbertMap().fit(torch.rand(50, 3), torch.ones(50), 3).state_dict())
+    assert scene.knows_variance(unsure)
+    colors = scene.variance_colors(unsure, np.array([[0, 0, z] for z in (0.01, 0.1, 1.0, 10.0)]))
+    assert (np.diff(colors[:, :3].astype(int).sum(axis=1)) > 0).all()
+    unsure.ready = False
+    assert not scene.knows_variance(unsure)
+    assert not scene.knows_variance(LardHilbertMap())
 
 
 def test_ellipsoids_are_turned_as_their_clusters_are():
