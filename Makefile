@@ -1,5 +1,6 @@
 # make demo   set-up and the main job: simulate a room, fit a map, evaluate it, draw it (out/)
 # make test   set-up, checks and tests
+# make docs   set-up and the documentation (out/docs/index.html); a warning is an error
 # make bench  set-up and the benchmarks (minutes)
 # make soak   set-up and the long checks: fuzzing, kills (tens of minutes)
 
@@ -28,6 +29,10 @@ test: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+docs: .venv/ready
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
+	@echo "documentation: out/docs/index.html"
 
 bench: .venv/bench
 	$(BIN)/python benchmarks/speed.py

@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from lardhm_torch.hilbert_map import LardHilbertMap
     from lardhm_torch.io import load_scans, save_scans
     from lardhm_torch.meshing import extract_mesh
-    from lardhm_torch.querying import grid, raycast
+    from lardhm_torch.querying import grid
+    from lardhm_torch.rays import raycast
     from lardhm_torch.sampling import Samples, SamplingConfig, sample_rays
     from lardhm_torch.scans import Scans, split_rays
     from lardhm_torch.simulation import simulate_room
@@ -27,7 +28,7 @@ _ROOM_OF = {
     "fine_tune": "tuning",
     "grid": "querying",
     "load_scans": "io",
-    "raycast": "querying",
+    "raycast": "rays",
     "sample_rays": "sampling",
     "save_scans": "io",
     "simulate_room": "simulation",

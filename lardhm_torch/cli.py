@@ -122,6 +122,48 @@ def grid(arguments: argparse.Namespace) -> None:
     print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 
+def view(arguments: argparse.Namespace) -> None:
+    """A map on a page for the browser, with its scans."""
+    import threading
+
+    from lardhm_torch import LardHilbertMap
+    from lardhm_torch.viewer import MapViewer, ViewConfig
+
+    model = LardHilbertMap.load(arguments.map)
+    scans = _load_scans(arguments, model.dim) if arguments.scans else None
+    config = ViewConfig(host=arguments.host, port=arguments.port, resolution=arguments.resolution)
+    viewer = MapViewer(model, scans, config)
+    try:
+        if arguments.export is not None:
+            viewer.export(arguments.export)
+            print(f"{len(model)} clusters -> {arguments.export}")
+            return
+        print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("ended")
+    finally:
+        viewer.close()
+
+
+def render(arguments: argparse.Namespace) -> None:
+    """A map to a picture, without a screen."""
+    from lardhm_torch import LardHilbertMap, extract_mesh
+    from lardhm_torch.rendering import render_mesh, render_slice
+
+    model = LardHilbertMap.load(arguments.map)
+    if arguments.slice is not None or model.dim == 2:
+        render_slice(model, arguments.output, arguments.slice, arguments.resolution)
+        print(f"slice -> {arguments.output}")
+        return
+    surface = extract_mesh(
+        model, arguments.resolution, arguments.threshold, color=arguments.color, progress=True
+    )
+    angles = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
+    render_mesh(surface, arguments.output, cut_above=arguments.cut_above, **angles)
+    print(f"{len(surface.faces)} faces -> {arguments.output}")
+
+
 def evaluate(arguments: argparse.Namespace) -> None:
     """A map against held-out rays."""
     from lardhm_torch import LardHilbertMap
@@ -246,6 +288,25 @@ def _map_verbs(verb: Any) -> None:
     _output(sub)
     sub.add_argument("--resolution", type=float, default=0.1, help="edge of a cell [m] (0.1)")
 
+    sub = verb(view)
+    sub.add_argument("map")
+    _scans(sub, nargs="*")
+    sub.add_argument("--host", default="127.0.0.1", help="0.0.0.0: for other machines, too")
+    sub.add_argument("--port", type=int, default=8080, help="of the page (8080 or the next free)")
+    sub.add_argument("--resolution", type=float, help="of the surface [m] (about 200,000 faces)")
+    sub.add_argument("--export", metavar="FILE", help="write the scene to .html or .viser and end")
+
+    sub = verb(render)
+    sub.add_argument("map")
+    _output(sub)
+    sub.add_argument("--slice", type=float, metavar="Z", help="the probability at this height [m]")
+    sub.add_argument("--resolution", type=float, default=0.05, help="lattice cell [m] (0.05)")
+    sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
+    sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
+    sub.add_argument("--azimuth", type=float, default=-60.0, help="of the camera [degrees] (-60)")
+    sub.add_argument("--elevation", type=float, default=40.0, help="of the camera [degrees] (40)")
+    sub.add_argument("--cut-above", type=float, metavar="Z", help="leave out what is higher [m]")
+
     sub = verb(evaluate)
     sub.add_argument("map")
     _scans(sub)
@@ -257,8 +318,8 @@ def _map_verbs(verb: Any) -> None:
     sub.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
 
-def _scans(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("scans", nargs="+", metavar="SCANS")
+def _scans(sub: argparse.ArgumentParser, nargs: str = "+") -> None:
+    sub.add_argument("scans", nargs=nargs, metavar="SCANS")
     sub.add_argument(
         "--origin",
         type=_numbers,

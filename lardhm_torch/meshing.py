@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.features import nearest_centers
-from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, cluster_boxes, grid_axes
+from lardhm_torch.native import nearest_centers
+from lardhm_torch.querying import EVIDENCE, cluster_boxes, grid_axes, lattice_values
 
 if TYPE_CHECKING:
     import trimesh
@@ -63,8 +64,37 @@ def extract_mesh(
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
     _check_meshing(model, resolution, threshold, color, evidence)
-    level = math.log(threshold / (1 - threshold))
-    supporters = ((model.weights > 0) if level >= 0 else (model.weights < 0)).nonzero().squeeze(1)
+    lattice = surface_lattice(model, resolution, threshold, bounds, progress=progress)
+    return lattice_mesh(model, lattice, threshold, color=color, evidence=evidence)
+
+
+class SurfaceLattice(NamedTuple):
+    """Log-odds on the blocks of a lattice in which a surface may lie.
+
+    ``corner`` (3,) world [m], ``resolution`` [m], ``cells`` (3,) number of cells, ``supporters``
+    (S,) clusters that pull to the threshold's side, and the blocks as pairs of the first cell (3,)
+    and values (n + 1, n + 1, n + 1); a generator, unless ``keep`` made it a list to march again.
+    """
+
+    corner: Tensor
+    resolution: float
+    cells: Tensor
+    supporters: Tensor
+    blocks: Iterable[tuple[Tensor, np.ndarray]]
+
+
+def surface_lattice(
+    model: Any,
+    resolution: float,
+    threshold: float = 0.5,
+    bounds: tuple[Any, Any] | None = None,
+    *,
+    keep: bool = False,
+    progress: bool = False,
+) -> SurfaceLattice:
+    """What `lattice_mesh` marches on: good for all thresholds on the same side of 1/2."""
+    chosen = (model.weights > 0) if threshold >= 0.5 else (model.weights < 0)
+    supporters = chosen.nonzero().squeeze(1)
     lower, upper = (box[supporters].cpu() for box in cluster_boxes(model))
     if bounds is not None:
         corner, end = (torch.as_tensor(b, dtype=torch.float64).cpu() for b in bounds)
@@ -73,17 +103,31 @@ def extract_mesh(
         touching = ((upper >= corner) & (lower <= end)).all(dim=1)
         lower, upper = lower[touching].maximum(corner), upper[touching].minimum(end)
     if len(lower) == 0:
-        return _to_mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        return SurfaceLattice(torch.zeros(3).double(), resolution, torch.ones(3), supporters, [])
     if bounds is None:
-        corner, end = (
-            lower.amin(dim=0),
-            upper.amax(dim=0) + resolution,
-        )  # whole cells cover the boxes
+        corner = lower.amin(dim=0)
+        end = upper.amax(dim=0) + resolution  # whole cells cover the boxes
     cells = ((end - corner) / resolution + 1e-6).floor().long().clamp(min=1)
-    blocks = active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
-    vertices, faces = _march_blocks(model, corner, resolution, blocks, cells, level, progress)
-    world = vertices * resolution + corner.numpy()
-    nearest = _nearest_supporters(model, supporters, world)
+    active = active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
+    blocks = _block_values(model, corner, resolution, active, cells, progress)
+    return SurfaceLattice(corner, resolution, cells, supporters, list(blocks) if keep else blocks)
+
+
+def lattice_mesh(
+    model: Any,
+    lattice: SurfaceLattice,
+    threshold: float = 0.5,
+    *,
+    color: str | None = "height",
+    evidence: float | None = EVIDENCE,
+) -> trimesh.Trimesh:
+    """As `extract_mesh`, on a lattice that was made for this map and this side of 1/2."""
+    level = math.log(threshold / (1 - threshold))
+    vertices, faces = _march_blocks(lattice.blocks, level)
+    if len(faces) == 0:
+        return _to_mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    world = vertices * lattice.resolution + lattice.corner.numpy()
+    nearest = _nearest_supporters(model, lattice.supporters, world)
     mesh = _to_mesh(world, faces, _vertex_colors(model, world, nearest, color))
     if evidence is not None:
         seen = _has_evidence(model, mesh, nearest, level, evidence)
@@ -123,31 +167,35 @@ def active_blocks(lower: Tensor, upper: Tensor, cells: Tensor) -> Tensor:
     return torch.cat(found).unique(dim=0)
 
 
-def _march_blocks(
-    model: Any,
-    corner: Tensor,
-    resolution: float,
-    blocks: Tensor,
-    cells: Tensor,
-    level: float,
-    progress: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3), in cells from the corner, and faces (F, 3) of all blocks, joined at seams."""
+@torch.no_grad()
+def _block_values(
+    model: Any, corner: Tensor, resolution: float, blocks: Tensor, cells: Tensor, progress: bool
+) -> Iterator[tuple[Tensor, np.ndarray]]:
+    """First cell (3,) and log-odds of every block, those inside the bounds."""
     from tqdm import tqdm
 
-    local = torch.stack(torch.meshgrid(*[torch.arange(BLOCK_CELLS + 1)] * 3, indexing="ij"), dim=-1)
+    device = model.centers.device
+    for block in tqdm(blocks, desc="mesh", disable=None if progress else True):
+        first_cell = block * BLOCK_CELLS
+        last_cell = (first_cell + BLOCK_CELLS).minimum(cells)
+        axes = [
+            (start + resolution * torch.arange(int(first), int(last) + 1, dtype=torch.float64)).to(
+                device
+            )
+            for start, first, last in zip(corner, first_cell, last_cell, strict=True)
+        ]
+        yield first_cell, lattice_values(model, axes, probability=False).float().cpu().numpy()
+
+
+def _march_blocks(
+    blocks: Iterable[tuple[Tensor, np.ndarray]], level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3), in cells from the corner, and faces (F, 3) of all blocks, joined at seams."""
     parts, num_vertices = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))], 0
-    batches = blocks.split(max(1, BLOCK_POINTS // local[..., 0].numel()))
-    for batch in tqdm(batches, desc="mesh", disable=None if progress else True):
-        first_cells = batch * BLOCK_CELLS  # (B, 3)
-        points = corner + resolution * (first_cells[:, None, None, None] + local)
-        with torch.no_grad():
-            log_odds = model.log_odds(points.to(model.centers.device)).float().cpu().numpy()
-        for first_cell, values in zip(first_cells, log_odds, strict=True):
-            n = (cells - first_cell).clamp(max=BLOCK_CELLS) + 1  # lattice planes inside the bounds
-            vertices, faces = _march(values[: n[0], : n[1], : n[2]], level)
-            parts.append((vertices + first_cell.numpy(), faces + num_vertices))
-            num_vertices += len(vertices)
+    for first_cell, values in blocks:
+        vertices, faces = _march(values, level)
+        parts.append((vertices + first_cell.numpy(), faces + num_vertices))
+        num_vertices += len(vertices)
     return _join(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]))
 
 
@@ -167,11 +215,18 @@ def _march(values: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _join(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One vertex for each position: blocks share lattice planes and agree on them to the last bit."""
-    unique, index = np.unique(vertices, axis=0, return_inverse=True)
+    """One vertex for each position: blocks share lattice planes and agree on them to the last bit.
+
+    Only vertices on a plane between blocks can have a twin; those alone are sorted.
+    """
+    seam = np.flatnonzero((vertices % BLOCK_CELLS == 0).any(axis=1))
+    _, first, twin = np.unique(vertices[seam], axis=0, return_index=True, return_inverse=True)
+    owner = np.arange(len(vertices))
+    owner[seam] = seam[first[twin.reshape(-1)]]
+    kept, index = np.unique(owner, return_inverse=True)
     faces = index.reshape(-1)[faces]
     collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    return unique, faces[~collapsed]
+    return vertices[kept], faces[~collapsed]
 
 
 def _nearest_supporters(model: Any, supporters: Tensor, world: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Questions to a map: lattices of points, slices, the first obstacle along a ray, gradients.
+"""Questions to a map at points: lattices, slices, bounds, gradients.
 
 A map is anything with the members of `LardHilbertMap` that are used here: ``log_odds(points)``,
 ``centers``, ``scale_tril``, ``weights``, ``origin`` and ``dim``.
@@ -14,8 +14,6 @@ from torch import Tensor
 
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # how far a cluster reaches: exp(-3² / 2) = 1 % of its peak
-BISECTIONS = 16  # a step of 5 cm is narrowed down to below 1 µm
-STRIDE = 16  # steps of a ray evaluated together, before finished rays are set aside
 EVIDENCE = 1.0  # log-odds beyond the threshold that something measured reaches; ripple does not
 
 
@@ -44,6 +42,9 @@ def grid(lower: Any, upper: Any, resolution: float, device: Any = None) -> Tenso
 
     Raises:
         ValueError: the corners are not finite, ordered and of one length, or resolution is not > 0.
+
+    >>> grid([0, 0], [1, 2], 0.5).shape
+    torch.Size([3, 5, 2])
     """
     axes = grid_axes(lower, upper, resolution, device)
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
@@ -69,22 +70,33 @@ def grid_axes(lower: Any, upper: Any, resolution: float, device: Any = None) -> 
     ]
 
 
-@torch.no_grad()
 def query_grid(model: Any, lower: Any, upper: Any, resolution: float) -> Tensor:
     """Probability at all points of `grid`, without holding the points: (nx, ny, nz).
 
-    Evaluated a million points at a time; the result has the map's dtype and device.
+    The result has the map's dtype and device.
     """
     axes = grid_axes(lower, upper, resolution, model.centers.device)
     if len(axes) != model.dim:
         raise ValueError(f"lower and upper must have {model.dim} coordinates; got {len(axes)}")
+    return lattice_values(model, axes, probability=True)
+
+
+@torch.no_grad()
+def lattice_values(model: Any, axes: list[Tensor], *, probability: bool) -> Tensor:
+    """Probability, or log-odds, at all combinations of D lists of world coordinates [m].
+
+    By the map's own ``query_lattice``, where it has one; else a million points at a time.
+    """
+    if hasattr(model, "query_lattice"):
+        return model.query_lattice(axes, probability=probability)
+    answer = model if probability else model.log_odds
     shape = [len(axis) for axis in axes]
     result = model.centers.new_empty(math.prod(shape))
     for start in range(0, len(result), BLOCK_POINTS):
         stop = min(start + BLOCK_POINTS, len(result))
         index = torch.unravel_index(torch.arange(start, stop, device=result.device), shape)
         points = torch.stack([axis[i] for axis, i in zip(axes, index, strict=True)], dim=1)
-        result[start:stop] = model(points)
+        result[start:stop] = answer(points)
     return result.reshape(shape)
 
 
@@ -156,130 +168,3 @@ def occupancy_gradient(model: Any, points: Tensor) -> Tensor:
     with torch.enable_grad():
         points = points.detach().clone().requires_grad_()
         return torch.autograd.grad(model.log_odds(points).sum(), points)[0]
-
-
-@torch.no_grad()
-def raycast(
-    model: Any,
-    origins: Tensor,
-    directions: Tensor,
-    max_range: float,
-    threshold: float = 0.5,
-    step: float | None = None,
-) -> Tensor:
-    """Distance along each ray at which the probability first rises above a threshold.
-
-    The ray is sampled every ``step`` until log-odds are clearly above the threshold, by 1; then
-    the place where they last crossed it is narrowed down by bisection. Without that margin the
-    ripple around 0 where nothing was measured would stop rays. A ray that starts clearly above the
-    threshold gives 0; one that starts in between is met where it gets clearly above.
-
-    Args:
-        model: the map.
-        origins: (R, D) or (D,) starts, world frame [m].
-        directions: (R, D) of any length but 0.
-        max_range: where to give up [m].
-        threshold: probability of occupancy that counts as an obstacle, between 0 and 1.
-        step: [m]; an obstacle thinner than this can be missed. Left out: the median standard
-            deviation of the occupied clusters across their surface, a third of a wall or less.
-
-    Returns:
-        (R,) float64 distances [m], infinite where nothing is met up to max_range.
-
-    Raises:
-        ValueError: shapes do not match, a direction is zero or not finite, or a number is not in
-            its range.
-    """
-    _check_raycast(model, origins, directions, max_range, threshold, step)
-    device = model.centers.device
-    directions = directions.to(device, torch.float64)
-    directions = directions / torch.linalg.vector_norm(directions, dim=1, keepdim=True)
-    origins = origins.to(device, torch.float64).expand_as(directions)
-    step = min(surface_step(model) if step is None else step, max_range)
-    level = math.log(threshold / (1 - threshold))
-    rays_at_once = max(1, BLOCK_POINTS // STRIDE)
-    parts = [
-        _march(model, start, heading, max_range, level, step)
-        for start, heading in zip(
-            origins.split(rays_at_once), directions.split(rays_at_once), strict=True
-        )
-    ]
-    return torch.cat(parts)
-
-
-def surface_step(model: Any) -> float:
-    """Median of the clusters' smallest standard deviation [m], of those that speak for occupied.
-
-    Raises:
-        ValueError: the map has no such cluster and so no surface.
-    """
-    factors = model.scale_tril[model.weights > 0].detach().double()
-    if len(factors) == 0:
-        raise ValueError("the map must hold a cluster of positive weight; got none: give a step")
-    return float(torch.linalg.svdvals(factors)[:, -1].median())
-
-
-def _march(
-    model: Any, origins: Tensor, directions: Tensor, max_range: float, level: float, step: float
-) -> Tensor:
-    """(R,) depth at which each ray meets the level; finished rays leave the batch."""
-    high = origins.new_full((len(origins),), torch.inf)  # first depth clearly above the level
-    low = torch.full_like(high, -1.0)  # last depth before it that is not above; -1: none yet
-    active = torch.arange(len(origins), device=origins.device)
-    steps = torch.arange(STRIDE, device=origins.device)
-    start = 0
-    while len(active) and start * step <= max_range:
-        depths = ((start + steps).double() * step).clamp(max=max_range)
-        points = origins[active, None] + depths[:, None] * directions[active, None]
-        log_odds = model.log_odds(points)
-        clear = log_odds > level + EVIDENCE
-        hit = clear.any(dim=1)
-        first = torch.where(hit, clear.to(torch.uint8).argmax(dim=1), STRIDE)
-        below = (log_odds <= level) & (steps < first[:, None])
-        last = torch.where(below, depths, -1.0).amax(dim=1)
-        low[active] = torch.maximum(low[active], last)
-        high[active[hit]] = depths[first[hit]]
-        active = active[~hit]
-        start += STRIDE
-    hits = high.isfinite().nonzero().squeeze(1)
-    target = torch.where(low[hits] < 0, level + EVIDENCE, level)
-    low = torch.where(low < 0, (high - step).clamp(min=0.0), low)
-    high[hits] = _bisect(model, origins[hits], directions[hits], low[hits], high[hits], target)
-    return high
-
-
-def _bisect(
-    model: Any, origins: Tensor, directions: Tensor, low: Tensor, high: Tensor, level: Tensor
-) -> Tensor:
-    """(R,) depths between low, where log-odds are not above the level, and high, where they are."""
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        above = model.log_odds(origins + middle[:, None] * directions) > level
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    return high
-
-
-def _check_raycast(
-    model: Any,
-    origins: Tensor,
-    directions: Tensor,
-    max_range: float,
-    threshold: float,
-    step: float | None,
-) -> None:
-    if directions.ndim != 2 or directions.shape[1] != model.dim:
-        raise ValueError(f"directions must be (R, {model.dim}); got {tuple(directions.shape)}")
-    if tuple(origins.shape) not in (tuple(directions.shape), (model.dim,)):
-        raise ValueError(
-            f"origins must be {tuple(directions.shape)} as the directions, or one ({model.dim},); "
-            f"got {tuple(origins.shape)}"
-        )
-    lengths = torch.linalg.vector_norm(directions.double(), dim=1)
-    if not ((lengths > 0) & lengths.isfinite()).all():
-        raise ValueError("directions must be finite and not zero; got one that is")
-    if not (max_range > 0 and math.isfinite(max_range)):
-        raise ValueError(f"max_range must be > 0 m and finite; got {max_range}")
-    if not 0 < threshold < 1:
-        raise ValueError(f"threshold must be between 0 and 1, both excluded; got {threshold}")
-    if step is not None and not step > 0:
-        raise ValueError(f"step must be > 0 m; got {step}")

@@ -4,56 +4,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import nn
+from small_maps import GaussianMap, ball, random_map
 
 from lardhm_torch import querying
 from lardhm_torch.querying import (
-    EVIDENCE,
     grid,
     map_bounds,
     occupancy_gradient,
     query_grid,
     query_slice,
-    raycast,
-    surface_step,
 )
-
-
-class GaussianMap(nn.Module):
-    """A map in a few lines: every cluster answers for every point."""
-
-    def __init__(self, centers, scale_tril, weights, origin=None):
-        super().__init__()
-        self.centers = nn.Parameter(torch.as_tensor(centers, dtype=torch.float64))
-        self.scale_tril = torch.as_tensor(scale_tril, dtype=torch.float64)
-        self.weights = nn.Parameter(torch.as_tensor(weights, dtype=torch.float64))
-        self.dim = self.centers.shape[1]
-        self.origin = torch.zeros(self.dim).double() if origin is None else origin
-
-    def log_odds(self, points):
-        offsets = (points - self.origin)[..., None, :] - self.centers
-        whitened = torch.linalg.solve_triangular(self.scale_tril, offsets[..., None], upper=False)
-        return torch.exp(-0.5 * whitened.square().sum(dim=(-2, -1))) @ self.weights
-
-    def forward(self, points):
-        return torch.sigmoid(self.log_odds(points))
-
-
-def ball(weight=6.0, sigma=0.3, dim=3, origin=None):
-    return GaussianMap(torch.zeros(1, dim), sigma * torch.eye(dim)[None], [weight], origin)
-
-
-def radius_where(log_odds, weight=6.0, sigma=0.3):
-    """Distance from the center of `ball` at which it has these log-odds, in closed form."""
-    return sigma * math.sqrt(2 * math.log(weight / log_odds))
-
-
-def random_map(seed, dim=3, clusters=6):
-    rng = torch.Generator().manual_seed(seed)
-    factors = 0.2 * torch.randn(clusters, dim, dim, generator=rng).tril(-1)
-    factors += torch.diag_embed(0.2 + torch.rand(clusters, dim, generator=rng))
-    weights = 4 * torch.randn(clusters, generator=rng)
-    return GaussianMap(2 * torch.randn(clusters, dim, generator=rng), factors, weights)
 
 
 def test_a_grid_starts_at_its_lower_corner_and_reaches_the_upper_one():
@@ -137,88 +97,6 @@ def test_gradients_agree_with_finite_differences():
     assert model.weights.grad is None
 
 
-@pytest.mark.parametrize("threshold", [0.5, 0.7, 0.9])
-@pytest.mark.parametrize("shift", [0.0, 4.5e6])
-def test_a_ray_toward_a_ball_stops_where_the_closed_form_says(threshold, shift):
-    origin = torch.full((3,), shift, dtype=torch.float64)
-    model = GaussianMap(
-        [[0.0, 0, 0], [-2.0, 0, 0]],
-        torch.stack([0.3 * torch.eye(3), 0.3 * torch.eye(3)]),
-        [6.0, -6.0],
-        origin,
-    )
-    start = origin + torch.tensor([-2.0, 0, 0])
-    ranges = raycast(
-        model, start, torch.tensor([[7.0, 0, 0], [0, 1, 0], [-1, 0, 0]]), 5.0, threshold
-    )
-    level = math.log(threshold / (1 - threshold))
-    # halfway between the two equal balls log-odds are 0; else the near one adds only its tail
-    expected = 1.0 if threshold == 0.5 else 2 - radius_where(level)
-    assert float(ranges[0]) == pytest.approx(expected, abs=1e-4)
-    assert ranges[1:].tolist() == [math.inf, math.inf]
-
-
-def test_the_probability_at_the_end_of_a_ray_is_the_threshold_and_lower_before():
-    rng = torch.Generator().manual_seed(0)
-    model = random_map(seed=7, clusters=20)
-    model.weights.data[:3] = -8.0
-    starts = model.centers.detach()[:3].repeat_interleave(40, dim=0)
-    directions = torch.randn(120, 3, generator=rng, dtype=torch.float64)
-    directions /= directions.norm(dim=1, keepdim=True)
-    ranges = raycast(model, starts, directions, 6.0, threshold=0.6, step=0.02)
-    met = ranges.isfinite() & (ranges > 0)
-    assert met.sum() > 20
-    ends = starts[met] + ranges[met, None] * directions[met]
-    outside = model(starts[met]) < 0.6
-    torch.testing.assert_close(
-        model(ends)[outside].detach(),
-        torch.full((int(outside.sum()),), 0.6).double(),
-        rtol=0,
-        atol=1e-4,
-    )
-    shares = torch.linspace(0, 1, 200, dtype=torch.float64)[:, None, None]
-    before = model.log_odds(starts[met] + shares * (ends - starts[met]))
-    assert (before <= math.log(0.6 / 0.4) + EVIDENCE).all()
-
-
-def test_ranges_do_not_depend_on_how_rays_are_batched(monkeypatch):
-    model = ball()
-    starts = torch.tensor([-2.0, 0.1, 0.0]).double()
-    directions = torch.randn(50, 3, generator=torch.Generator().manual_seed(1)).double()
-    together = raycast(model, starts, directions, 5.0)
-    monkeypatch.setattr(querying, "BLOCK_POINTS", 3 * querying.STRIDE)
-    torch.testing.assert_close(raycast(model, starts, directions, 5.0), together)
-
-
-def test_a_ray_that_starts_inside_has_range_zero_and_one_that_cannot_reach_has_none():
-    starts = torch.tensor([[0.0, 0, 0], [-2.0, 0, 0]]).double()
-    directions = torch.tensor([[1.0, 0, 0], [1.0, 0, 0]])
-    assert raycast(ball(), starts, directions, 1.0).tolist() == [0.0, math.inf]
-
-
-def test_a_ripple_where_nothing_was_measured_stops_no_ray():
-    faint = ball(weight=0.1)
-    assert raycast(faint, torch.tensor([-2.0, 0, 0]), torch.tensor([[1.0, 0, 0]]), 5.0) == math.inf
-
-
-def test_from_unknown_space_a_ray_ends_where_the_obstacle_becomes_clear():
-    ranges = raycast(ball(), torch.tensor([-1.0, 0, 0]), torch.tensor([[1.0, 0, 0]]), 5.0)
-    assert float(ranges) == pytest.approx(1 - radius_where(EVIDENCE), abs=1e-5)
-
-
-def test_no_rays_give_no_ranges():
-    assert raycast(ball(), torch.zeros(3), torch.zeros(0, 3), 5.0).shape == (0,)
-
-
-def test_the_step_is_the_thickness_of_the_occupied_clusters():
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double())[
-        0
-    ]
-    covariance = turn @ torch.diag(torch.tensor([0.04, 1.0, 2.0]).double() ** 2) @ turn.T
-    factors = torch.stack([torch.linalg.cholesky(covariance), 0.001 * torch.eye(3).double()])
-    assert surface_step(GaussianMap(torch.zeros(2, 3), factors, [1.0, -1.0])) == pytest.approx(0.04)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -248,39 +126,3 @@ def test_bad_slices_and_bounds_are_refused():
         query_slice(ball(dim=4), height=1.0)
     with pytest.raises(ValueError, match="it is empty: fit it first"):
         map_bounds(GaussianMap(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0)))
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"directions": torch.ones(2, 2)}, r"directions must be \(R, 3\); got \(2, 2\)"),
-        ({"origins": torch.zeros(3, 3)}, r"origins must be \(2, 3\).*got \(3, 3\)"),
-        ({"directions": torch.zeros(2, 3)}, "finite and not zero"),
-        ({"directions": torch.full((2, 3), math.nan)}, "finite and not zero"),
-        ({"max_range": 0.0}, "max_range must be > 0 m"),
-        ({"max_range": math.inf}, "max_range must be > 0 m and finite; got inf"),
-        ({"threshold": 1.0}, "threshold must be between 0 and 1, both excluded; got 1.0"),
-        ({"step": 0.0}, "step must be > 0 m; got 0.0"),
-    ],
-)
-def test_bad_rays_are_refused(changed, message):
-    arguments = {"origins": torch.zeros(3), "directions": torch.ones(2, 3), "max_range": 5.0}
-    with pytest.raises(ValueError, match=message):
-        raycast(ball(), **{**arguments, **changed})
-
-
-def test_a_map_without_occupied_clusters_needs_a_step():
-    model = ball(weight=-1.0)
-    with pytest.raises(ValueError, match="got none: give a step"):
-        raycast(model, torch.zeros(3), torch.ones(1, 3), 5.0)
-    assert raycast(model, torch.zeros(3), torch.ones(1, 3), 5.0, step=0.1) == math.inf
-
-
-def test_an_obstacle_wider_than_the_step_is_met_wherever_it_lies():
-    distances = torch.linspace(1.0, 40.0, 400, dtype=torch.float64)
-    starts = torch.zeros(400, 3, dtype=torch.float64)
-    starts[:, 0] = -distances
-    toward = torch.tensor([[1.0, 0, 0]]).expand(400, 3)
-    ranges = raycast(ball(), starts, toward, 50.0, threshold=0.6, step=1.0)
-    expected = distances - radius_where(math.log(0.6 / 0.4))
-    torch.testing.assert_close(ranges, expected.clamp(min=0), rtol=0, atol=1e-3)

@@ -1,0 +1,116 @@
+"""Rays against maps: how far ranges are off on held-out rays, and how fast they come.
+
+Usage: python benchmarks/raycasting.py [--data DATA] [--only error speed]
+
+error: half of at most 120,000 rays of each set train the map (default settings, seed 0), the ranges of
+the others are asked for. speed: 10^6 rays against the map of a street, beside OctoMap's castRay, which
+answers one ray a call; its loop is timed on 10,000 of the rays, for several voxel sizes.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from conditions import conditions, describe
+
+from lardhm_torch import LardHilbertMap, load_scans, raycast, sample_rays, split_rays
+from lardhm_torch.metrics import protocol_rays
+from lardhm_torch.segments import expected_range
+
+SETS = (
+    "paper_virtual",
+    "la3dm_sim_structured",
+    "riegl_vz400i_rtls",
+    "tdtk_dat",
+    "balm_realworld",
+    "kitti00_mulls",
+    "sevenscenes_rgbd",
+    "sevenscenes_semidense",
+)
+STREET = "kitti00_mulls"
+MAX_RANGE = 80.0  # [m]
+VOXELS = (0.1, 0.2, 0.4)  # [m]
+
+
+def fitted(data: Path, name: str):
+    """The map of half of the rays, both halves."""
+    rays = protocol_rays(load_scans(data / name / "scans.npz"), 120_000)
+    train, test = split_rays(rays, 0.5, 0)
+    samples = sample_rays(train)
+    return LardHilbertMap().fit(samples.points, samples.labels).requires_grad_(False), train, test
+
+
+def errors(data: Path) -> None:
+    """Median error [m] and share of rays that meet anything, for all sets."""
+    print(f"{'set':<24}{'ridge':>8}{'met':>7}{'crossing':>10}{'expected':>10}   median error [m]")
+    for name in SETS:
+        model, _, test = fitted(data, name)
+        ways = test.ends - test.ray_origins
+        ridge, crossing = (
+            raycast(model, test.ray_origins, ways, MAX_RANGE, surface=s)
+            for s in ("peak", "crossing")
+        )
+        few = torch.arange(0, len(test), len(test) // 300)
+        mean = expected_range(model, test.ray_origins[few], ways[few], float(test.ranges.max()) + 1)
+        off = [(r - test.ranges).abs().median() for r in (ridge, crossing)]
+        off.append((mean - test.ranges[few]).abs().median())
+        met = float(ridge.isfinite().double().mean())
+        print(f"{name:<24}{off[0]:>8.3f}{met:>7.3f}{off[1]:>10.3f}{off[2]:>10.3f}", flush=True)
+
+
+def speed(data: Path) -> None:
+    """Time of 10^6 rays, and of OctoMap's loop."""
+    model, train, test = fitted(data, STREET)
+    rng = torch.Generator().manual_seed(0)
+    pick = torch.randint(len(test), (1_000_000,), generator=rng)
+    origins, ways = test.ray_origins[pick], (test.ends - test.ray_origins)[pick]
+    ways = ways + 0.01 * ways.norm(dim=1, keepdim=True) * torch.randn(ways.shape, generator=rng)
+    raycast(model, origins[:1000], ways[:1000], MAX_RANGE)
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        ranges = raycast(model, origins, ways, MAX_RANGE)
+        seconds.append(time.perf_counter() - start)
+    ours = float(np.median(seconds))
+    met = float(ranges.isfinite().double().mean())
+    print(f"{'lardhm_torch':<24}{ours:>8.2f} s for 10^6 rays, {met:.3f} met")
+    for voxel in VOXELS:
+        theirs, met = octomap_seconds(train, origins, ways, voxel)
+        print(
+            f"{f'OctoMap castRay {voxel} m':<24}{theirs:>8.2f} s for 10^6 rays, {met:.3f} met"
+            f"   {theirs / ours:.1f} x",
+            flush=True,
+        )
+
+
+def octomap_seconds(train, origins, ways, voxel: float, count: int = 10_000) -> tuple[float, float]:
+    """Seconds for 10^6 rays, from ``count`` of them, and the share that met anything."""
+    from lardhm_torch.baselines.octomap import OctoMapBaseline
+
+    baseline = OctoMapBaseline(voxel).fit(train)
+    starts = (origins[:count] - baseline.origin).numpy()
+    headings = (ways[:count] / ways[:count].norm(dim=1, keepdim=True)).numpy()
+    end, met = np.zeros(3), 0
+    start = time.perf_counter()
+    for origin, heading in zip(starts, headings, strict=True):
+        met += baseline.tree.castRay(origin, heading, end, True, MAX_RANGE)
+    return (time.perf_counter() - start) * 1_000_000 / count, met / count
+
+
+def main() -> None:
+    """Both parts."""
+    parser = argparse.ArgumentParser(description="Ranges of held-out rays, and their speed.")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--only", nargs="+", choices=("error", "speed"), default=("error", "speed"))
+    arguments = parser.parse_args()
+    print(describe(conditions()))
+    if "error" in arguments.only:
+        errors(arguments.data)
+    if "speed" in arguments.only:
+        speed(arguments.data)
+
+
+if __name__ == "__main__":
+    main()

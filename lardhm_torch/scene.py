@@ -1,0 +1,123 @@
+"""What a viewer shows of a map, as arrays: slice, ellipsoids, points and colors.
+
+Positions are relative to an ``offset`` near the middle of the map, so that float32 is enough.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lardhm_torch.querying import query_slice
+from lardhm_torch.scans import Scans
+
+SLICE_PIXELS = 512  # along the longer edge
+MESH_FACES = 200_000  # about; the resolution is chosen for it
+
+
+def core_box(model: Any, share: float = 0.02, margin: float = 0.5) -> tuple[Tensor, Tensor]:
+    """(3,) and (3,) world corners around all but the outermost clusters [m]: what is worth a look."""
+    chosen = model.weights > 0
+    centers = model.centers[chosen if bool(chosen.any()) else ...].detach().double().cpu()
+    ends = torch.quantile(centers, torch.tensor([share, 1 - share], dtype=torch.float64), dim=0)
+    return ends[0] + model.origin.cpu() - margin, ends[1] + model.origin.cpu() + margin
+
+
+def view_resolution(model: Any) -> float:
+    """Edge of a cell [m] at which the surface has about `MESH_FACES` faces.
+
+    The clusters lie on the surface like tiles of two standard deviations to each side.
+    """
+    factors = model.scale_tril.detach()[model.weights > 0].double()
+    if len(factors) == 0:
+        return 0.1
+    stds = torch.linalg.svdvals(factors) / model.covariance_scale**0.5
+    area = 8 * float((stds[:, 0] * stds[:, 1]).sum())
+    return max(0.02, (4 * area / MESH_FACES) ** 0.5)
+
+
+def slice_picture(
+    model: Any, height: float, core: tuple[Tensor, Tensor], offset: np.ndarray
+) -> dict[str, Any]:
+    """Probability at a height above the offset [m], as the arguments of viser's `add_image`."""
+    from matplotlib import colormaps
+
+    pixel = float((core[1] - core[0])[:2].max()) / SLICE_PIXELS
+    probability, extent = query_slice(model, height + float(offset[2]), pixel, core)
+    p = probability.float().cpu().numpy().T[::-1]  # rows from the top, that is from large y
+    image = colormaps["RdBu_r"](p, bytes=True)
+    image[..., 3] = np.clip(np.abs(p - 0.5) * 1000, 40, 235)  # the unknown is nearly clear
+    middle = [(extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2]
+    return {
+        "image": image,
+        "render_width": extent[1] - extent[0],
+        "render_height": extent[3] - extent[2],
+        "format": "png",
+        "wxyz": (0.0, 1.0, 0.0, 0.0),  # image rows go down: turned about x, they go along -y
+        "position": (middle[0] - offset[0], middle[1] - offset[1], height),
+    }
+
+
+def ellipsoids(model: Any, chosen: Tensor, offset: np.ndarray) -> dict[str, Any]:
+    """Clusters at one standard deviation, as the arguments of viser's batched meshes."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    factors = model.scale_tril.detach()[chosen].double().cpu()
+    axes, stds, _ = torch.linalg.svd(factors)
+    axes[torch.linalg.det(axes) < 0, :, 2] *= -1
+    centers = model.centers.detach()[chosen].double().cpu() + model.origin.cpu()
+    return {
+        "vertices": ball.vertices,
+        "faces": ball.faces,
+        "batched_wxyzs": quaternions(axes.numpy()),
+        "batched_positions": (centers.numpy() - offset).astype(np.float32),
+        "batched_scales": (stds / model.covariance_scale**0.5).numpy().astype(np.float32),
+    }
+
+
+def scan_points(scans: Scans, most: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) hits, a random subset of too many, and (N, 3) grays that tell height."""
+    from matplotlib import colormaps
+
+    hits = scans.hits
+    hits = hits[hits.isfinite().all(dim=1)].cpu()
+    if len(hits) > most:
+        hits = hits[torch.randperm(len(hits), generator=torch.Generator().manual_seed(0))[:most]]
+    points = (hits.numpy() - offset).astype(np.float32)
+    low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
+    shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
+    return points, colormaps["gray"](shades, bytes=True)[:, :3]
+
+
+def knows_variance(model: Any) -> bool:
+    """Whether the map can tell how unsure it is: has ``variance``, and what that needs."""
+    if not hasattr(model, "variance"):
+        return False
+    try:
+        model.variance(model.centers[:1].detach().double() + model.origin)
+    except RuntimeError:
+        return False
+    return True
+
+
+def variance_colors(model: Any, vertices: np.ndarray) -> np.ndarray:
+    """(V, 4) RGBA: dark where the map is certain, bright where it is not."""
+    from matplotlib import colormaps
+
+    points = torch.as_tensor(vertices, device=model.centers.device)
+    with torch.no_grad():
+        variance = model.variance(points).double().cpu().numpy()
+    logs = np.log10(np.maximum(variance, 1e-12))
+    low, high = np.quantile(logs, [0.02, 0.98])
+    return colormaps["magma"]((logs - low) / max(high - low, 1e-9), bytes=True)
+
+
+def quaternions(rotations: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) rotation matrices -> (N, 4) quaternions w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]].astype(np.float32)

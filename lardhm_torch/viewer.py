@@ -1,0 +1,357 @@
+"""A map in the browser: surface, slice, clusters and scans on a page that a server sends.
+
+viser does the drawing; it works without a screen, and `MapViewer.export` writes the scene as one
+file. Coordinates on the page are relative to the middle of the map, in float32.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from lardhm_torch.meshing import COLORS, lattice_mesh, surface_lattice
+from lardhm_torch.scans import Scans
+from lardhm_torch.scene import (
+    core_box,
+    ellipsoids,
+    knows_variance,
+    scan_points,
+    slice_picture,
+    variance_colors,
+    view_resolution,
+)
+
+if TYPE_CHECKING:
+    import trimesh
+
+EXPORT_SUFFIXES = (".html", ".viser")
+OCCUPIED, FREE = (200, 70, 60), (70, 110, 190)  # colors of the clusters
+LATEST_WINS = ("map", "threshold", "color")  # what the worker does, in this order
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig:
+    """Where the page is served and how much is sent to it."""
+
+    host: str = "127.0.0.1"  # 0.0.0.0: other machines may look, too
+    port: int = 8080  # the next free one, if it is taken
+    resolution: float | None = None  # [m] of the surface; None: for about 200,000 faces
+    max_points: int = 1_000_000  # of the scans; a random subset of more
+    max_clusters: int = 10_000  # ellipsoids; those with the largest weights of more
+
+    def __post_init__(self) -> None:
+        if self.resolution is not None and not self.resolution > 0:
+            raise ValueError(f"resolution must be > 0 m; got {self.resolution}")
+        for name in ("max_points", "max_clusters"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be 1 or more; got {getattr(self, name)}")
+
+
+class MapViewer:
+    """A page that shows a map; meshing goes on in a thread, so that the page stays responsive.
+
+    Args:
+        model: a 3-D map with clusters.
+        scans: shown as points and sensor positions, where given.
+        config: where to serve, and how much.
+
+    Raises:
+        ImportError: viser is not installed.
+        ValueError: the map is not 3-D or is empty.
+    """
+
+    def __init__(
+        self, model: Any, scans: Scans | None = None, config: ViewConfig | None = None
+    ) -> None:
+        self.config = config or ViewConfig()
+        _check_model(model)
+        self.server = _new_server(self.config)
+        self._core = core_box(model)
+        self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
+        self._model = _snapshot(model)
+        self._mesh: Any = None
+        self._lattice: Any = None
+        self._wanted: set[str] = set()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._add_controls()
+        if scans is not None:
+            self._add_scans(scans)
+        self._aim_camera()
+        self.update(model)
+        self._worker = threading.Thread(target=self._work, daemon=True)
+        self._worker.start()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{self.config.host}:{self.server.get_port()}"
+
+    def update(self, model: Any) -> None:
+        """Show this state of the map: a loop that grows it calls this after each step.
+
+        Returns at once; states that come faster than they can be drawn are left out.
+        """
+        _check_model(model)
+        snapshot = _snapshot(model)
+        with self._changed:
+            self._model = snapshot
+        self._ask("map")
+
+    def wait(self) -> None:
+        """Until all that was asked for is on the page."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._wanted or self._closed)
+
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """Write the scene to one .html file that opens in any browser, or to a .viser file.
+
+        Raises:
+            ValueError: the path ends in neither.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in EXPORT_SUFFIXES:
+            known = " or ".join(EXPORT_SUFFIXES)
+            raise ValueError(f"path must end in {known} for a scene; got {path.name!r}")
+        self.wait()
+        scene = self.server.get_scene_serializer()
+        html = path.suffix.lower() == ".html"
+        content = scene.as_html().encode() if html else scene.serialize()
+        partial = path.with_name(f".{path.name}.partial")
+        try:
+            partial.write_bytes(content)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Stop the thread and the server."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._worker.join()
+        self.server.stop()
+
+    # --- controls ---
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        self._status = gui.add_markdown("starting ...")
+        with gui.add_folder("Surface"):
+            self._show_mesh = gui.add_checkbox("show surface", True)
+            self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5)
+            colors = [*COLORS, *(["variance"] if knows_variance(self._model) else [])]
+            self._color = gui.add_dropdown("color", colors, initial_value="height")
+        lower, upper = (end.numpy() - self.offset for end in self._core)
+        with gui.add_folder("Slice"):
+            self._show_slice = gui.add_checkbox("show slice", False)
+            self._height = gui.add_slider(
+                "height [m]",
+                float(np.floor(lower[2] * 20) / 20),
+                float(np.ceil(upper[2] * 20) / 20),
+                0.05,
+                float(np.round((lower[2] + upper[2]) * 10) / 20),
+            )
+        with gui.add_folder("Clusters"):
+            self._show_occupied = gui.add_checkbox("show occupied", False)
+            self._show_free = gui.add_checkbox("show free", False)
+        self._threshold.on_update(lambda _: self._ask("threshold"))
+        self._color.on_update(lambda _: self._ask("color"))
+        for control in (self._show_slice, self._height):
+            control.on_update(lambda _: self._draw_slice())
+        for control in (self._show_mesh, self._show_occupied, self._show_free):
+            control.on_update(lambda _: self._apply_visibility())
+
+    def _ask(self, job: str) -> None:
+        with self._changed:
+            self._wanted.add(job)
+            self._changed.notify_all()
+
+    def _work(self) -> None:
+        """The thread: does what was asked for last, and forgets what was asked for before."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted or self._closed)
+                if self._closed:
+                    return
+                job = next(name for name in LATEST_WINS if name in self._wanted)
+                self._wanted = {"busy"}  # one drawing answers all that was asked for until now
+                model = self._model
+            try:
+                self._status.content = "*drawing ...*"
+                self._draw(model, job)
+            except Exception as error:
+                self._status.content = f"**{type(error).__name__}**: {error}"
+            with self._changed:
+                self._wanted.discard("busy")
+                self._changed.notify_all()
+
+    def _draw(self, model: Any, job: str) -> None:
+        if job == "map":
+            resolution = self.config.resolution or view_resolution(model)
+            self._lattice = surface_lattice(model, resolution, keep=True)
+            self._draw_clusters(model)
+            self._draw_slice()
+        color = self._color.value
+        if job != "color" or self._mesh is None:
+            threshold = float(self._threshold.value)
+            plain = "height" if color == "variance" else color
+            self._mesh = lattice_mesh(model, self._lattice, threshold, color=plain)
+            self._drawn_color = plain
+        mesh = self._mesh
+        if color not in (self._drawn_color, "variance"):
+            threshold = float(self._threshold.value)
+            mesh = self._mesh = lattice_mesh(model, self._lattice, threshold, color=color)
+            self._drawn_color = color
+        if color == "variance" and len(mesh.vertices):
+            mesh.visual.vertex_colors = variance_colors(model, np.asarray(mesh.vertices))
+            self._drawn_color = "variance"
+        self._send_mesh(mesh)
+        self._status.content = (
+            f"{len(model):,} clusters; surface of {len(mesh.faces):,} faces, "
+            f"cells of {self._lattice.resolution:.3g} m. "
+            f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
+        )
+
+    # --- the scene ---
+
+    def _send_mesh(self, mesh: trimesh.Trimesh) -> None:
+        scene = self.server.scene
+        if len(mesh.faces) == 0:
+            scene.remove_by_name("/surface")
+            return
+        moved = mesh.copy()
+        moved.apply_translation(-self.offset)
+        scene.add_mesh_trimesh("/surface", moved, visible=self._show_mesh.value, cast_shadow=False)
+
+    def _draw_slice(self) -> None:
+        scene = self.server.scene
+        if not self._show_slice.value:
+            scene.remove_by_name("/slice")
+            return
+        height = float(self._height.value)
+        picture = slice_picture(self._model, height, self._core, self.offset)
+        scene.add_image("/slice", **picture, cast_shadow=False, receive_shadow=False)
+
+    def _draw_clusters(self, model: Any) -> None:
+        weights = model.weights.detach()
+        order = weights.abs().argsort(descending=True)[: self.config.max_clusters]
+        for name, color, mask, control in (
+            ("/clusters/occupied", OCCUPIED, weights[order] > 0, self._show_occupied),
+            ("/clusters/free", FREE, weights[order] < 0, self._show_free),
+        ):
+            chosen = order[mask]
+            if len(chosen):
+                self._send_ellipsoids(model, name, color, chosen, control.value)
+            else:
+                self.server.scene.remove_by_name(name)
+
+    def _send_ellipsoids(
+        self, model: Any, name: str, color: tuple[int, int, int], chosen: Tensor, visible: bool
+    ) -> None:
+        self.server.scene.add_batched_meshes_simple(
+            name,
+            **ellipsoids(model, chosen, self.offset),
+            batched_colors=color,
+            opacity=0.9,
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=visible,
+        )
+
+    def _add_scans(self, scans: Scans) -> None:
+        points, colors = scan_points(scans, self.config.max_points, self.offset)
+        gui, scene = self.server.gui, self.server.scene
+        with gui.add_folder("Scans"):
+            self._show_scans = gui.add_checkbox("show points", True)
+            self._show_origins = gui.add_checkbox("show sensors", True)
+            size = gui.add_slider("point size [m]", 0.005, 0.1, 0.005, 0.02)
+        cloud = scene.add_point_cloud(
+            "/scans", points, colors, point_size=0.02, precision="float32"
+        )
+        origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
+        sensors = scene.add_point_cloud(
+            "/sensors", origins, (255, 150, 0), point_size=0.12, point_shape="circle"
+        )
+
+        def apply(_: Any) -> None:
+            cloud.visible, sensors.visible = self._show_scans.value, self._show_origins.value
+            cloud.point_size = size.value
+
+        for control in (self._show_scans, self._show_origins, size):
+            control.on_update(apply)
+
+    def _apply_visibility(self) -> None:
+        for name, control in (
+            ("/surface", self._show_mesh),
+            ("/clusters/occupied", self._show_occupied),
+            ("/clusters/free", self._show_free),
+        ):
+            handle = self.server.scene.get_handle_by_name(name)
+            if handle is not None:
+                handle.visible = control.value
+
+    def _aim_camera(self) -> None:
+        """From obliquely above, far enough to see where most clusters are."""
+        low, high = (end.numpy() - self.offset for end in self._core)
+        reach = max(float(np.linalg.norm(high - low)), 1.0)
+        camera = self.server.initial_camera
+        camera.look_at = tuple((low + high) / 2)
+        camera.position = tuple((low + high) / 2 + reach * np.array([0.25, -0.5, 0.5]))
+        self.server.scene.set_up_direction("+z")
+
+
+class LiveView:
+    """The page of a map that does not exist yet: opened by the first update, redrawn by each.
+
+    Args:
+        config: where to serve, and how much.
+    """
+
+    def __init__(self, config: ViewConfig | None = None) -> None:
+        self.config = config
+        self.viewer: MapViewer | None = None
+
+    def update(self, model: Any) -> None:
+        """Show this state of the map; an empty one is not shown yet."""
+        if len(model.centers) == 0:
+            return
+        if self.viewer is None:
+            self.viewer = MapViewer(model, config=self.config)
+        else:
+            self.viewer.update(model)
+
+    def close(self) -> None:
+        """Stop serving, if there was anything to serve."""
+        if self.viewer is not None:
+            self.viewer.close()
+
+
+def _new_server(config: ViewConfig) -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError(
+            "the viewer needs viser, which is not installed; "
+            'install the extra: pip install "lardhm_torch[view]"'
+        ) from error
+    return viser.ViserServer(config.host, config.port, label="lardhm", verbose=False)
+
+
+def _check_model(model: Any) -> None:
+    if model.dim != 3:
+        raise ValueError(f"model must be a 3-D map to be viewed; got {model.dim}-D")
+    if len(model.centers) == 0:
+        raise ValueError("the map must hold clusters to be viewed; it is empty: fit it first")
+
+
+def _snapshot(model: Any) -> Any:
+    """A copy that training on does not change."""
+    return copy.deepcopy(model).requires_grad_(False)

@@ -1,0 +1,42 @@
+"""The picture of the viewer's page: fit a map, open the page in Chromium, take a screenshot.
+
+Usage: python scripts/screenshot_viewer.py SCANS [PICTURE]    (default: docs/pictures/viewer.png)
+"""
+
+import shutil
+import sys
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+from lardhm_torch import LardHilbertMap, load_scans, sample_rays
+from lardhm_torch.viewer import MapViewer
+
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+def main(scans_path: str, picture: Path) -> None:
+    """Show the surface, the slice and the sensors."""
+    scans = load_scans(scans_path)
+    samples = sample_rays(scans)
+    viewer = MapViewer(LardHilbertMap().fit(samples.points, samples.labels), scans)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), headless=True, args=FLAGS
+        )
+        page = browser.new_page(viewport={"width": 1200, "height": 760})
+        page.set_default_timeout(600_000)
+        page.goto(viewer.url)
+        page.get_by_text("surface of").wait_for()
+        for label in ("show points", "show slice"):
+            page.get_by_label(label).click()
+        if page.locator(".mantine-Notification-closeButton").count():
+            page.locator(".mantine-Notification-closeButton").first.click()
+        page.wait_for_timeout(15_000)
+        page.screenshot(path=picture)
+        browser.close()
+    viewer.close()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2] if len(sys.argv) > 2 else "docs/pictures/viewer.png"))

@@ -1,0 +1,237 @@
+import importlib.util
+import io
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, scene, simulate_room
+from lardhm_torch.viewer import LiveView, MapViewer, ViewConfig
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+PATIENCE = 120_000  # [ms] a shared machine draws in software
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None, reason="viser is not installed"
+)
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return simulate_room(6000, seed=0)
+
+
+@pytest.fixture(scope="module")
+def model(scans):
+    samples = sample_rays(scans)
+    return LardHilbertMap().fit(samples.points, samples.labels, 400)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A real Chromium; the test is skipped with a reason where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+    if path is None:
+        pytest.skip("no Chromium is installed")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser):
+    page = browser.new_page(viewport={"width": 900, "height": 600})
+    page.set_default_timeout(PATIENCE)
+    yield page
+    page.close()
+
+
+def settled(page):
+    """What the 3-D part of the page shows (H, W, 3), once it does not change any more."""
+    from PIL import Image
+
+    before = None
+    for _ in range(100):
+        page.wait_for_timeout(700)
+        png = page.screenshot(clip={"x": 0, "y": 150, "width": 560, "height": 400})
+        now = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+        if before is not None and np.abs(now - before).max() < 8:
+            return now
+        before = now
+    raise AssertionError("the page does not come to rest")
+
+
+def share_changed(one, other):
+    return float((np.abs(one - other).max(axis=2) > 24).mean())
+
+
+def share_drawn(picture):
+    return float((picture.min(axis=2) < 240).mean())
+
+
+def test_what_is_clicked_in_the_browser_is_seen(model, scans, page):
+    shown = MapViewer(model, scans, ViewConfig(resolution=0.1))
+    try:
+        page.goto(shown.url)
+        page.get_by_text("surface of").wait_for()
+        all_of_it = settled(page)
+        assert share_drawn(all_of_it) > 0.05
+
+        page.get_by_label("show points").click()
+        page.get_by_label("show sensors").click()
+        surface = settled(page)
+        assert share_changed(all_of_it, surface) > 0.005
+
+        page.get_by_role("slider").nth(0).focus()
+        page.keyboard.press("End")  # threshold 0.99: the surface shrinks
+        page.wait_for_timeout(1000)
+        shown.wait()
+        assert shown._threshold.value == pytest.approx(0.99)
+        page.get_by_text("surface of").wait_for()
+        thin = settled(page)
+        assert share_changed(surface, thin) > 0.01
+        assert share_drawn(thin) < share_drawn(surface)
+
+        page.get_by_label("show surface").click()
+        nothing = settled(page)
+        assert share_drawn(nothing) < 0.02
+
+        page.get_by_label("show slice").click()
+        cut = settled(page)
+        assert share_drawn(cut) > 0.03
+        blue = (cut[..., 2] - cut[..., 0] > 60).mean()
+        red = (cut[..., 0] - cut[..., 2] > 60).mean()
+        assert blue > red > 0  # more free than occupied
+        page.get_by_label("show slice").click()
+
+        page.get_by_label("show occupied").click()
+        clusters = settled(page)
+        assert share_drawn(clusters) > 0.01
+        assert (clusters[..., 0] - clusters[..., 2] > 40).mean() > 0.005  # they are red
+    finally:
+        shown.close()
+
+
+def test_a_map_under_construction_is_shown_as_it_grows(scans, page):
+    samples = sample_rays(scans.select(scans.scan_id == 0))
+    model = LardHilbertMap().fit(samples.points, samples.labels, 200)
+    shown = MapViewer(model, config=ViewConfig(resolution=0.1))
+    try:
+        page.goto(shown.url)
+        page.get_by_text(f"{len(model)} clusters").wait_for()
+        first = settled(page)
+        samples = sample_rays(scans)
+        model.fit(samples.points, samples.labels, 400)
+        shown.update(model)
+        page.get_by_text(f"{len(model)} clusters").wait_for()
+        assert share_changed(first, settled(page)) > 0.01
+    finally:
+        shown.close()
+
+
+def test_an_exported_scene_opens_without_a_server(model, page, tmp_path):
+    shown = MapViewer(model, config=ViewConfig(resolution=0.1))
+    try:
+        shown.export(tmp_path / "scene.html")
+        shown.export(tmp_path / "scene.viser")
+        with pytest.raises(ValueError, match=r"must end in \.html or \.viser.*got 'scene\.obj'"):
+            shown.export(tmp_path / "scene.obj")
+    finally:
+        shown.close()
+    assert (tmp_path / "scene.viser").stat().st_size > 10_000
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.html", "scene.viser"]
+    page.goto((tmp_path / "scene.html").as_uri())
+    page.wait_for_timeout(3000)
+    assert share_drawn(settled(page)) > 0.05
+
+
+def test_the_commands_write_a_scene_and_pictures(model, scans, tmp_path, capsys):
+    model.save(tmp_path / "map.pt")
+    save_scans(scans, tmp_path / "scans.npz")
+    commands = (
+        "view map.pt scans.npz --export scene.html --resolution 0.2",
+        "render map.pt -o surface.png --resolution 0.2 --cut-above 2.2",
+        "render map.pt -o slice.png --slice 1.0",
+    )
+    for command in commands:
+        verb, *words = command.split()
+        paths = [str(tmp_path / w) if "." in w and not w[0].isdigit() else w for w in words]
+        assert cli.main([verb, *paths]) == 0, capsys.readouterr().err
+    for name in ("scene.html", "surface.png", "slice.png"):
+        assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_a_flat_or_empty_map_is_refused():
+    with pytest.raises(ValueError, match="must be a 3-D map to be viewed; got 2-D"):
+        MapViewer(LardHilbertMap(dim=2))
+    with pytest.raises(ValueError, match="it is empty: fit it first"):
+        MapViewer(LardHilbertMap())
+
+
+def test_the_page_of_a_map_to_come_opens_with_its_first_cluster(model):
+    live = LiveView(ViewConfig(resolution=0.3))
+    live.update(LardHilbertMap())
+    assert live.viewer is None
+    live.update(model)
+    live.update(model)
+    assert live.viewer.url.startswith("http://127.0.0.1:")
+    live.viewer.wait()
+    live.close()
+
+
+class UnsureMap(LardHilbertMap):
+    """Unsure in proportion to the height; or not yet, like a map without posterior."""
+
+    ready = True
+
+    def variance(self, points):
+        if not self.ready:
+            raise RuntimeError("no posterior")
+        return points[..., 2].clamp(min=0)
+
+
+def test_variance_is_offered_where_the_map_knows_it_and_colors_grow_with_it():
+    unsure = UnsureMap()
+    unsure.load_state_dict(LardHilbertMap().fit(torch.rand(50, 3), torch.ones(50), 3).state_dict())
+    assert scene.knows_variance(unsure)
+    colors = scene.variance_colors(unsure, np.array([[0, 0, z] for z in (0.01, 0.1, 1.0, 10.0)]))
+    assert (np.diff(colors[:, :3].astype(int).sum(axis=1)) > 0).all()
+    unsure.ready = False
+    assert not scene.knows_variance(unsure)
+    assert not scene.knows_variance(LardHilbertMap())
+
+
+def test_ellipsoids_are_turned_as_their_clusters_are():
+    rotation = torch.linalg.qr(torch.randn(4, 3, 3, dtype=torch.float64))[0]
+    rotation[torch.linalg.det(rotation) < 0, :, 2] *= -1
+    w, x, y, z = scene.quaternions(rotation.numpy()).T.astype(np.float64)
+    first_column = np.stack(
+        [1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1
+    )
+    np.testing.assert_allclose(first_column, rotation[:, :, 0].numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"resolution": 0.0}, "resolution must be > 0 m; got 0.0"),
+        ({"max_points": 0}, "max_points must be 1 or more; got 0"),
+        ({"max_clusters": 0}, "max_clusters must be 1 or more; got 0"),
+    ],
+)
+def test_bad_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        ViewConfig(**settings)
