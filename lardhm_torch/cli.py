@@ -52,6 +52,7 @@ def split(arguments: argparse.Namespace) -> None:
 def fit(arguments: argparse.Namespace) -> None:
     """Scans to a map."""
     from lardhm_torch import LardHilbertMap, fine_tune, sample_rays
+    from lardhm_torch.checkpoint import load_state, save_state
 
     scans = _load_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
@@ -61,13 +62,16 @@ def fit(arguments: argparse.Namespace) -> None:
     model.fit(
         samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True
     )
-    if arguments.tune:
+    if arguments.tune or arguments.tune_state:
+        path = arguments.tune_state
         fine_tune(
             model,
             samples.points,
             samples.labels,
-            ray_id=samples.ray_id,
+            resample=lambda epoch: sample_rays(scans, seed=arguments.seed + epoch),
             seed=arguments.seed,
+            state=load_state(path) if path and Path(path).exists() else None,
+            after_epoch=(lambda state: save_state(state, path)) if path else None,
             progress=True,
         )
     model.save(arguments.output)
@@ -218,6 +222,11 @@ def _scan_verbs(verb: Any) -> None:
     sub.add_argument("--clusters", type=int, help="total number (chosen from the data)")
     sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
     sub.add_argument("--tune", action="store_true", help="also learn centers and length-scales")
+    sub.add_argument(
+        "--tune-state",
+        metavar="FILE",
+        help="--tune, saved after every epoch; continued if it exists",
+    )
     sub.add_argument("--dim", type=int, help="2 drops a constant last column")
     _seed(sub)
 

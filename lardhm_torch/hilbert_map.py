@@ -52,7 +52,7 @@ class LardHilbertMap(nn.Module):
     def __init__(
         self,
         dim: int = 3,
-        num_neighbors: int = 8,
+        num_neighbors: int = 16,
         *,
         covariance_scale: float = 4.0,
         min_lengthscale: float = 0.01,
