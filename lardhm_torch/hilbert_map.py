@@ -158,6 +158,8 @@ class LardHilbertMap(nn.Module):
 
     def _fresh_index(self) -> Tensor:
         """The neighbor search's index, made anew whenever the centers are not those it was made of."""
+        if torch.compiler.is_compiling():  # no branch on values; the operators check it themselves
+            return self._index
         if not native.index_matches(self._index, self.centers, self.num_neighbors):
             self._index = native.build_index(self.centers, self.num_neighbors)
         return self._index
@@ -219,6 +221,16 @@ class LardHilbertMap(nn.Module):
         learned._train_weights(local, labels, config or FitConfig(), rng, progress)
         self.load_state_dict(learned.state_dict())
         return self
+
+    def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
+        """Groups for an optimizer, with weight decay on the weights alone.
+
+        Decay would pull centers to the map's origin and length-scales to 1 m.
+        """
+        return [
+            {"params": [self.weights], "weight_decay": weight_decay},
+            {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
+        ]
 
     def _train_weights(
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
