@@ -118,13 +118,16 @@ def mesh(arguments: argparse.Namespace) -> None:
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """A map against held-out rays."""
-    from lardhm_torch import LardHilbertMap
-    from lardhm_torch.metrics import evaluate as evaluate_map
-    from lardhm_torch.metrics import format_metrics
+    from lardhm_torch import LardHilbertMap, metrics
+    from lardhm_torch.calibration import draw_reliability
 
     model = LardHilbertMap.load(arguments.map)
-    table = evaluate_map(model, _load_scans(arguments, model.dim), seed=arguments.seed)
-    print(json.dumps(table, indent=2) if arguments.json else format_metrics(table))
+    scans = _load_scans(arguments, model.dim)
+    answers = metrics.answer_held_out(model, scans, seed=arguments.seed)
+    table = metrics.score_held_out(answers)
+    if arguments.reliability:
+        draw_reliability(metrics.reliability_held_out(answers), arguments.reliability)
+    print(json.dumps(table, indent=2) if arguments.json else metrics.format_metrics(table))
 
 
 def info(arguments: argparse.Namespace) -> None:
@@ -248,6 +251,7 @@ def _map_verbs(verb: Any) -> None:
     sub.add_argument("map")
     _scans(sub)
     sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    sub.add_argument("--reliability", metavar="FILE", help="reliability diagrams, .png")
     _seed(sub)
 
     sub = verb(info)

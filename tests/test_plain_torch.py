@@ -118,7 +118,7 @@ def test_a_cast_map_answers_nearly_the_same(model, samples, dtype):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("lightning") is None, reason="lightning is missing")
-@pytest.mark.filterwarnings("default")  # its own
+@pytest.mark.filterwarnings("ignore")  # its own
 def test_a_lightning_module_trains_the_map(model, samples, tmp_path):
     import lightning
 

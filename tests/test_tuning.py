@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from lardhm_torch import LardHilbertMap, Samples, TuneConfig, fine_tune
+from lardhm_torch.backpropagation import LabelledPoints, batches
 from lardhm_torch.checkpoint import load_state, save_state
-from lardhm_torch.tuning import _batches, _hold_out, _Points
+from lardhm_torch.tuning import _hold_out
 
 F64 = torch.float64
 
@@ -89,7 +90,7 @@ def test_held_out_rays_do_not_train_even_when_sampled_anew():
     model, points, labels = fitted()
     ray_id = torch.arange(len(points)) % 50
     liar, config = copy.deepcopy(model), TuneConfig(epochs=3, hold_out=0.3)
-    held = _hold_out(_Points(points, labels, ray_id), 0.3, torch.Generator().manual_seed(0))
+    held = _hold_out(LabelledPoints(points, labels, ray_id), 0.3, torch.Generator().manual_seed(0))
     assert 5 < len(held) < 30
     lies = torch.where(torch.isin(ray_id, held), 1 - labels, labels)
     ends, epochs = [], []
@@ -161,17 +162,17 @@ def test_a_state_of_another_map_or_config_is_refused():
 @pytest.mark.parametrize(("count", "batch"), [(1, 4), (10, 3), (1000, 64), (64, 64)])
 def test_batches_hold_every_row_once_and_some_of_every_stretch(count, batch):
     rng = torch.Generator().manual_seed(0)
-    batches = list(_batches(count, batch, rng))
-    assert torch.equal(torch.cat(batches).sort().values, torch.arange(count))
-    assert max(map(len, batches)) <= batch
-    for rows in batches:
-        assert (rows.diff() < 2 * len(batches)).all()
+    taken = list(batches(count, batch, rng))
+    assert torch.equal(torch.cat(taken).sort().values, torch.arange(count))
+    assert max(map(len, taken)) <= batch
+    for rows in taken:
+        assert (rows.diff() < 2 * len(taken)).all()
 
 
 def test_a_failure_leaves_the_map_as_it_was(monkeypatch):
     model, points, labels = fitted()
     before = model.centers.clone()
-    monkeypatch.setattr("lardhm_torch.tuning._Run.train", lambda *_: 1 / 0)
+    monkeypatch.setattr("lardhm_torch.backpropagation.TuningRun.train", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         fine_tune(model, points, labels)
     assert torch.equal(model.centers, before)
