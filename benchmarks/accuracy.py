@@ -46,11 +46,17 @@ def lard_hilbert_map(train: Scans, seed: int) -> Model:
 @torch.enable_grad()
 def tuned_hilbert_map(train: Scans, seed: int) -> Model:
     """The same with centers, length-scales and weights trained by backpropagation."""
-    from lardhm_torch import fine_tune  # type: ignore[attr-defined]
+    from lardhm_torch import fine_tune
 
     samples = sample_rays(train, seed=seed)
     model = LardHilbertMap(dim=train.dim).fit(samples.points, samples.labels, seed=seed)
-    fine_tune(model, samples.points, samples.labels, seed=seed)
+    fine_tune(
+        model,
+        samples.points,
+        samples.labels,
+        resample=lambda epoch: sample_rays(train, seed=seed + epoch),
+        seed=seed,
+    )
     return model
 
 

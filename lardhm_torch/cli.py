@@ -50,6 +50,7 @@ def split(arguments: argparse.Namespace) -> None:
 def fit(arguments: argparse.Namespace) -> None:
     """Scans to a map."""
     from lardhm_torch import LardHilbertMap, fine_tune, sample_rays
+    from lardhm_torch.checkpoint import load_state, save_state
 
     scans = _load_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
@@ -59,13 +60,16 @@ def fit(arguments: argparse.Namespace) -> None:
     model.fit(
         samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True
     )
-    if arguments.tune:
+    if arguments.tune or arguments.tune_state:
+        path = arguments.tune_state
         fine_tune(
             model,
             samples.points,
             samples.labels,
-            ray_id=samples.ray_id,
+            resample=lambda epoch: sample_rays(scans, seed=arguments.seed + epoch),
             seed=arguments.seed,
+            state=load_state(path) if path and Path(path).exists() else None,
+            after_epoch=(lambda state: save_state(state, path)) if path else None,
             progress=True,
         )
     model.save(arguments.output)
@@ -166,13 +170,16 @@ def render(arguments: argparse.Namespace) -> None:
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """A map against held-out rays."""
-    from lardhm_torch import LardHilbertMap
-    from lardhm_torch.metrics import evaluate as evaluate_map
-    from lardhm_torch.metrics import format_metrics
+    from lardhm_torch import LardHilbertMap, metrics
+    from lardhm_torch.calibration import draw_reliability
 
     model = LardHilbertMap.load(arguments.map)
-    table = evaluate_map(model, _load_scans(arguments, model.dim), seed=arguments.seed)
-    print(json.dumps(table, indent=2) if arguments.json else format_metrics(table))
+    scans = _load_scans(arguments, model.dim)
+    answers = metrics.answer_held_out(model, scans, seed=arguments.seed)
+    table = metrics.score_held_out(answers)
+    if arguments.reliability:
+        draw_reliability(metrics.reliability_held_out(answers), arguments.reliability)
+    print(json.dumps(table, indent=2) if arguments.json else metrics.format_metrics(table))
 
 
 def info(arguments: argparse.Namespace) -> None:
@@ -266,6 +273,11 @@ def _scan_verbs(verb: Any) -> None:
     sub.add_argument("--clusters", type=int, help="total number (chosen from the data)")
     sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
     sub.add_argument("--tune", action="store_true", help="also learn centers and length-scales")
+    sub.add_argument(
+        "--tune-state",
+        metavar="FILE",
+        help="--tune, saved after every epoch; continued if it exists",
+    )
     sub.add_argument("--dim", type=int, help="2 drops a constant last column")
     _seed(sub)
 
@@ -311,6 +323,7 @@ def _map_verbs(verb: Any) -> None:
     sub.add_argument("map")
     _scans(sub)
     sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    sub.add_argument("--reliability", metavar="FILE", help="reliability diagrams, .png")
     _seed(sub)
 
     sub = verb(info)

@@ -14,8 +14,8 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.native import nearest_centers
 
-POINTS_PER_CLUSTER = 20  # of the rule that chooses the number of clusters
-MAX_CHOSEN = 3000  # a class
+POINTS_PER_CLUSTER = 15  # of the rule that chooses the number of clusters
+MAX_CHOSEN = 5000  # a class
 START_POINTS = 50  # a center, drawn at random, among which the start is chosen
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 

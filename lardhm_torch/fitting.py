@@ -35,7 +35,10 @@ class FitConfig:
     preconditioner: bool = True  # A of eq. (4): running root mean square gradient; else identity
     l2: float = 0.03  # lambda_1 of eq. (2), against the sum of the losses of all points
     l1: float = 0.0  # lambda_2 of eq. (2), by soft thresholding: weights become exactly 0
-    balance: bool = True  # each class counts for half of the loss, however few its points
+    balance: bool = True  # the classes share the loss in a fixed way, however few their points
+    # The occupied class's share where classes are balanced. More than half, because hits are few
+    # and free points many: what is learned of hits carries over to unseen rays less surely.
+    occupied_share: float = 0.6
 
     def rows_a_batch(self, num_points: int) -> int:
         """Points a step."""
@@ -48,6 +51,8 @@ class FitConfig:
             raise ValueError(f"batch_size must be 1 or more; got {self.batch_size}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate must be > 0; got {self.learning_rate}")
+        if not 0 < self.occupied_share < 1:
+            raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
         if self.l1 < 0 or self.l2 < 0:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
@@ -70,16 +75,20 @@ def training_order(points: Tensor, batch_size: int, rng: torch.Generator) -> Ten
     return dealt[dealt >= 0]
 
 
-def balance_classes(labels: Tensor) -> Tensor:
-    """(N,) labels -> (N,) loss factors with mean 1 that give both classes the same total.
+def class_factors(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
+    """(N,) labels -> (2,) loss factors of a free and an occupied point, so that classes share the loss.
 
-    With a single class present all factors are 1.
+    Over all points they have mean 1. With a single class present both are 1.
     """
-    occupied = labels.sum()
+    occupied = labels.sum().double()
     free = len(labels) - occupied
-    half = 0.5 * len(labels)
-    balanced = torch.where(labels > 0.5, half / occupied, half / free)
+    balanced = len(labels) * torch.stack([(1 - occupied_share) / free, occupied_share / occupied])
     return torch.where((occupied > 0) & (free > 0), balanced, torch.ones_like(balanced))
+
+
+def balance_classes(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
+    """(N,) labels -> (N,) loss factors, see `class_factors`."""
+    return class_factors(labels, occupied_share).to(labels)[labels.long()]
 
 
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
@@ -118,7 +127,8 @@ def fit_weights(
 
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
-    factors = balance_classes(labels) if config.balance else torch.ones_like(labels)
+    share = config.occupied_share
+    factors = balance_classes(labels, share) if config.balance else torch.ones_like(labels)
     batch_size = config.rows_a_batch(len(labels))
     plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))

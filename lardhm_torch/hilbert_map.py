@@ -14,6 +14,8 @@ from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariance
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, fit_weights, training_order
 
+CHECK_CHUNK = 1 << 18  # points checked at a time: the check takes no memory to speak of
+
 
 class LardHilbertMap(nn.Module):
     """Continuous occupancy: a weighted sum of local kernel features gives the log-odds.
@@ -56,7 +58,7 @@ class LardHilbertMap(nn.Module):
     def __init__(
         self,
         dim: int = 3,
-        num_neighbors: int = 8,
+        num_neighbors: int = 16,
         *,
         covariance_scale: float = 4.0,
         min_lengthscale: float = 0.01,
@@ -204,6 +206,8 @@ class LardHilbertMap(nn.Module):
 
     def _fresh_index(self) -> Tensor:
         """The neighbor search's index, made anew whenever the centers are not those it was made of."""
+        if torch.compiler.is_compiling():  # no branch on values; the operators check it themselves
+            return self._index
         if not native.index_matches(self._index, self.centers, self.num_neighbors):
             self._index = native.build_index(self.centers, self.num_neighbors)
         return self._index
@@ -295,6 +299,16 @@ class LardHilbertMap(nn.Module):
         self.posterior_means = scale * self.weights.detach()
         self.posterior_variances = variances
         return self
+
+    def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
+        """Groups for an optimizer, with weight decay on the weights alone.
+
+        Decay would pull centers to the map's origin and length-scales to 1 m.
+        """
+        return [
+            {"params": [self.weights], "weight_decay": weight_decay},
+            {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
+        ]
 
     def _train_weights(
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
@@ -398,15 +412,16 @@ def check_samples(
         )
     if len(points) == 0:
         raise ValueError("points must hold at least one point; got 0")
-    if not bool(points.isfinite().all()):
+    if not all(bool(chunk.isfinite().all()) for chunk in points.split(CHECK_CHUNK)):
         bad = ~points.isfinite().all(dim=1)
         raise ValueError(
             f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
             f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
         )
-    wrong = (labels != 0) & (labels != 1)
-    if bool(wrong.any()):
-        value = labels[wrong][0].item()
+    chunks = labels.split(CHECK_CHUNK)
+    wrong = next((c[w] for c in chunks if bool((w := (c != 0) & (c != 1)).any())), None)
+    if wrong is not None:
+        value = wrong[0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
         raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
     return points, labels

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.calibration import calibration_error, reliability
 from lardhm_torch.scans import Scans
 
 if TYPE_CHECKING:
@@ -16,9 +17,9 @@ if TYPE_CHECKING:
 
 MIN_RANGE, MAX_RANGE = 0.3, 60.0  # [m] rays outside are not test rays
 NEAR_START, NEAR_END = 0.6, 0.2  # [m] before the hit: where the near points lie
+FREE_KINDS = ("unif", "near", "paper")
 PAPER_SHARE = 0.95  # of a ray: where the paper's own free test points lie
 CLIP = 1e-6  # probabilities are clipped to [CLIP, 1 - CLIP] in the log-loss
-CALIBRATION_BINS = 15
 F_SCORE_LIMITS = (0.05, 0.1)  # [m]
 QUERY_POINTS = 1 << 20  # points asked at a time
 
@@ -106,9 +107,7 @@ def occupancy_metrics(on_hits: Tensor, on_free: Tensor) -> dict[str, float]:
     on_hits = _check_probability(on_hits, "on_hits")
     on_free = _check_probability(on_free, "on_free")
     hit_rate, free_rate = (on_hits > 0.5).double().mean(), (on_free < 0.5).double().mean()
-    p = torch.cat([on_hits, on_free])
-    labels = torch.cat([torch.ones_like(on_hits), torch.zeros_like(on_free)])
-    mass = torch.cat([o.new_full(o.shape, 0.5 / len(o)) for o in (on_hits, on_free)])
+    p, labels, mass = _both_classes(on_hits, on_free)
     of_truth = torch.where(labels > 0.5, p, 1 - p).clamp(CLIP, 1 - CLIP)
     scores = {
         "balanced_accuracy": 0.5 * (hit_rate + free_rate),
@@ -122,6 +121,14 @@ def occupancy_metrics(on_hits: Tensor, on_free: Tensor) -> dict[str, float]:
         "unknown": (p == 0.5).double().mean(),
     }
     return {name: float(value) for name, value in scores.items()}
+
+
+def _both_classes(on_hits: Tensor, on_free: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(N,) probabilities, labels and masses: each class has mass 1/2."""
+    answers = (on_hits.double().cpu(), on_free.double().cpu())
+    labels = torch.cat([torch.ones_like(answers[0]), torch.zeros_like(answers[1])])
+    mass = torch.cat([answer.new_full(answer.shape, 0.5 / len(answer)) for answer in answers])
+    return torch.cat(answers), labels, mass
 
 
 def _check_probability(p: Tensor, name: str) -> Tensor:
@@ -140,43 +147,9 @@ def _check_probability(p: Tensor, name: str) -> Tensor:
     return p
 
 
-def reliability(p: Tensor, labels: Tensor, mass: Tensor, bins: int = CALIBRATION_BINS) -> Tensor:
-    """Reliability diagram: (bins, 3) mass, mean probability and occupied share of each bin.
-
-    Points are ranked by probability and cut into bins of equal mass. Points of equal probability
-    cannot be told apart, so each counts with the occupied share of them all: the order in which
-    they come must not matter, nor a bin's edge that falls among them.
-
-    Args:
-        p: (N,) probabilities.
-        labels: (N,) 1 occupied, 0 free.
-        mass: (N,) what each point counts, sum 1.
-        bins: how many.
-    """
-    order = p.argsort()
-    p, labels, mass = p[order], labels[order], mass[order]
-    _, group = torch.unique_consecutive(p, return_inverse=True)
-    sums = mass.new_zeros(len(p), 3).index_add_(
-        0, group, torch.stack([mass, mass * labels, torch.ones_like(mass)], dim=1)
-    )
-    occupied, mass = (sums[:, 1] / sums[:, 0])[group], (sums[:, 0] / sums[:, 2])[group]
-    which = ((mass.cumsum(0) - 0.5 * mass) * bins).long().clamp(0, bins - 1)
-    columns = torch.stack([mass, mass * p, mass * occupied], dim=1)
-    total = torch.zeros(bins, 3, dtype=p.dtype, device=p.device).index_add_(0, which, columns)
-    return torch.cat([total[:, :1], total[:, 1:] / total[:, :1].clamp(min=1e-300)], dim=1)
-
-
-def calibration_error(p: Tensor, labels: Tensor, mass: Tensor) -> Tensor:
-    """Expected calibration error: mean distance of probability and occupied share over the bins."""
-    diagram = reliability(p, labels, mass)
-    return (diagram[:, 0] * (diagram[:, 1] - diagram[:, 2]).abs()).sum()
-
-
 @torch.no_grad()
-def evaluate(
-    model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0
-) -> dict[str, dict[str, float]]:
-    """Scores of a map on held-out rays, for each kind of free point: unif, near, paper.
+def answer_held_out(model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0) -> HeldOut:
+    """Probabilities of a map at the test points of held-out rays, each (R,).
 
     Args:
         model: (N, D) world positions -> (N,) probability of occupancy.
@@ -186,7 +159,6 @@ def evaluate(
     Raises:
         ValueError: no ray is usable, or the model answers with anything but (N,) probabilities.
     """
-    points = held_out_points(scans, seed)
 
     def ask(positions: Tensor) -> Tensor:
         answers = [model(chunk) for chunk in positions.split(QUERY_POINTS)]
@@ -197,11 +169,30 @@ def evaluate(
             )
         return torch.cat(answers)
 
-    on_hits = ask(points.hits)
+    return HeldOut(*map(ask, held_out_points(scans, seed)))
+
+
+def score_held_out(answers: HeldOut) -> dict[str, dict[str, float]]:
+    """Scores for each kind of free point: unif, near, paper."""
+    return {kind: occupancy_metrics(answers.hits, getattr(answers, kind)) for kind in FREE_KINDS}
+
+
+def reliability_held_out(answers: HeldOut) -> dict[str, Tensor]:
+    """Reliability diagram for each kind of free point, both classes of the same mass."""
     return {
-        kind: occupancy_metrics(on_hits, ask(getattr(points, kind)))
-        for kind in ("unif", "near", "paper")
+        kind: reliability(*_both_classes(answers.hits, getattr(answers, kind)))
+        for kind in FREE_KINDS
     }
+
+
+def evaluate(
+    model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0
+) -> dict[str, dict[str, float]]:
+    """Scores of a map on held-out rays, for each kind of free point: unif, near, paper.
+
+    Arguments and errors are those of `answer_held_out`.
+    """
+    return score_held_out(answer_held_out(model, scans, seed))
 
 
 def format_metrics(table: dict[str, dict[str, float]]) -> str:

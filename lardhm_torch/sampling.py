@@ -21,8 +21,8 @@ class SamplingConfig:
 
     min_range: float = 0.3  # [m] shorter rays end in the sensor's own body and are dropped
     max_range: float = 100.0  # [m] beyond it a ray is cut and has no hit
-    free_spacing: float = 1.0  # [m] one free sample for every such stretch of a ray
-    near_samples: int = 1  # free samples close in front of each hit
+    free_samples: int = 6  # along every ray, one in each of as many equal stretches
+    near_samples: int = 2  # free samples close in front of each hit
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
 
@@ -32,8 +32,8 @@ class SamplingConfig:
                 "min_range and max_range must satisfy 0 <= min_range < max_range < inf; "
                 f"got {self.min_range} and {self.max_range}"
             )
-        if not self.free_spacing > 0:
-            raise ValueError(f"free_spacing must be > 0 m; got {self.free_spacing}")
+        if self.free_samples < 1:
+            raise ValueError(f"free_samples must be 1 or more; got {self.free_samples}")
         if self.near_samples < 0:
             raise ValueError(f"near_samples must be 0 or more; got {self.near_samples}")
         if not 0 <= self.near_margin < self.near_reach:
@@ -126,7 +126,7 @@ def _free_depths(
 ) -> tuple[Tensor, Tensor]:
     """(F,) ray number and (F,) depth [m] of every free sample, stratified ones first."""
     device = free_end.device
-    strata = (free_end / config.free_spacing).round().long().clamp(min=1) * first
+    strata = config.free_samples * first.long()
     ray = torch.repeat_interleave(strata)
     before = strata.cumsum(0) - strata
     step = torch.arange(len(ray), device=device) - before[ray]

@@ -9,6 +9,7 @@ import trimesh
 from healthy_files import BagMaker, bag_messages
 
 from lardhm_torch import LardHilbertMap, Scans, load_scans, save_scans
+from lardhm_torch.checkpoint import save_state
 from lardhm_torch.cli import main
 
 
@@ -127,6 +128,31 @@ def test_evaluate_prints_a_table_or_json(folder, capsys):
     run("evaluate", folder / "map.pt", folder / "test.npz", "--json")
     table = json.loads(capsys.readouterr().out)
     assert table["unif"]["balanced_accuracy"] > 0.97
+
+
+def test_evaluate_draws_reliability_diagrams(folder, capsys):
+    run("evaluate", folder / "map.pt", folder / "test.npz", "--reliability", folder / "r.png")
+    assert (folder / "r.png").read_bytes().startswith(b"\x89PNG")
+    bad = ("evaluate", folder / "map.pt", folder / "test.npz", "--reliability", folder / "r.gif")
+    assert "path must end in .png" in fails(capsys, *bad)
+
+
+def test_tuning_that_was_interrupted_goes_on_from_its_state(folder, monkeypatch):
+    words = ("fit", folder / "train.npz", "--clusters", 60)
+    run(*words, "--tune", "-o", folder / "whole.pt")
+
+    def interrupt(state, path):
+        save_state(state, path)
+        if state.get("epoch") == 5:
+            raise KeyboardInterrupt
+
+    kept = ("--tune-state", folder / "state.pt", "-o", folder / "resumed.pt")
+    monkeypatch.setattr("lardhm_torch.checkpoint.save_state", interrupt)
+    assert main([str(word) for word in (*words, *kept)]) == 130
+    monkeypatch.undo()
+    run(*words, *kept)
+    whole, resumed = (LardHilbertMap.load(folder / name) for name in ("whole.pt", "resumed.pt"))
+    assert torch.equal(whole.raw_scale_tril, resumed.raw_scale_tril)
 
 
 def test_info_tells_what_the_map_holds(folder, capsys):

@@ -147,9 +147,9 @@ def test_classes_are_clustered_apart_occupied_first():
         ([20, 1000], 100, [4, 96]),
         ([1000, 0], 100, [100, 0]),
         ([3, 3], 500, [1, 1]),
-        ([1000, 8000], None, [50, 50]),
-        ([0, 400], None, [0, 20]),
-        ([10**7, 10**8], None, [3000, 3000]),
+        ([1500, 8000], None, [100, 100]),
+        ([0, 300], None, [0, 20]),
+        ([10**7, 10**8], None, [5000, 5000]),
     ],
 )
 def test_clusters_are_split_over_the_classes(sizes, asked, given_out):

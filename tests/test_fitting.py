@@ -38,11 +38,23 @@ def fit(indices, values, labels, clusters, **settings):
 
 
 @pytest.mark.parametrize("balance", [True, False])
-def test_weights_reach_scikit_learns_optimum(balance):
+def test_weights_reach_scikit_learns_optimum_with_the_classes_in_the_shares_asked(balance):
     indices, values, labels = problem()
-    ours = fit(indices, values, labels, 12, passes=600, batch_size=600, l2=0.5, balance=balance)
+    ours = fit(
+        indices,
+        values,
+        labels,
+        12,
+        passes=600,
+        batch_size=600,
+        l2=0.5,
+        balance=balance,
+        occupied_share=0.6,
+    )
+    occupied, total = int(labels.sum()), len(labels)
+    shares = {0: 0.4 * total / (total - occupied), 1: 0.6 * total / occupied}
     exact = LogisticRegression(
-        C=1.0, fit_intercept=False, class_weight="balanced" if balance else None, tol=1e-10
+        C=1.0, fit_intercept=False, class_weight=shares if balance else None, tol=1e-10
     ).fit(dense(indices, values, 12), labels)
     np.testing.assert_allclose(ours, exact.coef_[0], atol=2e-3)
 
@@ -82,7 +94,7 @@ def test_the_gradient_equals_autograd():
 
 def test_the_default_is_within_a_percent_of_the_optimum():
     indices, values, labels = problem(points=20000, clusters=200)
-    factors = balance_classes(labels)
+    factors = balance_classes(labels, FitConfig().occupied_share)
 
     def loss(weights):
         return float(logistic_loss((values * weights[indices]).sum(dim=1), labels, factors))
@@ -97,6 +109,8 @@ def test_both_classes_weigh_the_same_however_rare_one_is():
     torch.testing.assert_close(factors[labels == 1].sum(), factors[labels == 0].sum())
     torch.testing.assert_close(factors.mean(), torch.tensor(1.0))
     assert torch.equal(balance_classes(torch.ones(4)), torch.ones(4))
+    leaning = balance_classes(labels, occupied_share=0.6)
+    torch.testing.assert_close(leaning[labels == 1].sum() / leaning.sum(), torch.tensor(0.6))
 
 
 def test_the_start_is_left_alone():

@@ -179,7 +179,7 @@ def test_copies_and_pickles_are_the_same_map():
 
 def test_settings_that_differ_are_named_and_nothing_is_loaded():
     model, other = wall_map(), LardHilbertMap(num_neighbors=6).double()
-    with pytest.raises(ValueError, match=r"num_neighbors = 6; got 8.*num_neighbors=8"):
+    with pytest.raises(ValueError, match=r"num_neighbors = 6; got 16.*num_neighbors=16"):
         other.load_state_dict(model.state_dict())
     assert len(other) == 0
 

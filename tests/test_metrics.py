@@ -7,15 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import brier_score_loss, log_loss, roc_auc_score
 
+from lardhm_torch.calibration import calibration_error, draw_reliability, reliability
 from lardhm_torch.metrics import (
-    calibration_error,
+    answer_held_out,
     evaluate,
     format_metrics,
     held_out_points,
     mesh_metrics,
     occupancy_metrics,
     protocol_rays,
-    reliability,
+    reliability_held_out,
 )
 from lardhm_torch.scans import Scans
 
@@ -198,6 +199,20 @@ def test_a_reliability_diagram_worked_out_by_hand():
     diagram = reliability(p, labels, torch.full((4,), 0.25).double(), bins=2)
     expected = torch.tensor([[0.5, 0.3, 0.5], [0.5, 0.7, 0.5]]).double()
     torch.testing.assert_close(diagram, expected)
+
+
+def test_the_reliability_of_held_out_answers_has_the_calibration_error_of_the_scores(tmp_path):
+    answers = answer_held_out(lambda points: (points[:, 0] * 7).sin().square(), sphere_scan())
+    scores = occupancy_metrics(answers.hits, answers.near)
+    diagrams = reliability_held_out(answers)
+    mass, said, was = diagrams["near"].T
+    assert float((mass * (said - was).abs()).sum()) == pytest.approx(scores["ece"])
+    draw_reliability(diagrams, tmp_path / "reliability.png")
+    assert (tmp_path / "reliability.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ValueError, match=r"path must end in \.png"):
+        draw_reliability(diagrams, tmp_path / "reliability.jpg")
+    with pytest.raises(ValueError, match="diagrams must hold at least one"):
+        draw_reliability({}, tmp_path / "reliability.png")
 
 
 def test_evaluate_asks_the_model_at_the_held_out_points_in_world_coordinates():

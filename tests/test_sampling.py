@@ -42,7 +42,7 @@ def test_every_usable_hit_is_kept_exactly_and_labelled_occupied():
 
 def test_free_samples_are_stratified_over_the_ray():
     scans = Scans(torch.zeros(1, 3), torch.tensor([[10.15, 0.0, 0.0]]))
-    samples = sample_rays(scans, SamplingConfig(near_samples=0))
+    samples = sample_rays(scans, SamplingConfig(free_samples=10, near_samples=0))
     depth = samples.points[samples.labels == 0, 0].sort().values
     assert torch.equal(depth.floor().long(), torch.arange(10))
 
@@ -120,7 +120,7 @@ def test_no_usable_ray_is_an_error_that_counts_the_reasons():
     [
         ({"min_range": -1}, "0 <= min_range < max_range < inf; got -1"),
         ({"max_range": float("inf")}, "got 0.3 and inf"),
-        ({"free_spacing": 0}, "free_spacing must be > 0 m; got 0"),
+        ({"free_samples": 0}, "free_samples must be 1 or more; got 0"),
         ({"near_samples": -1}, "near_samples must be 0 or more; got -1"),
         ({"near_margin": 0.7}, "near_margin < near_reach; got 0.7"),
     ],
