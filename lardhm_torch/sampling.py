@@ -115,7 +115,10 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     rng = torch.Generator(device=ranges.device).manual_seed(seed)
     ray, depth = _free_depths(free_end, is_hit & first, config, rng, first)
     hits = is_hit.nonzero().squeeze(1)
-    points = torch.cat([scans.ends[rays[hits]], origins[ray] + depth[:, None] * directions[ray]])
+    # the starts of a single scan are one point: gathering them for every sample takes longest
+    starts = scans.origins[:1] if scans.num_scans == 1 else origins.index_select(0, ray)
+    free = torch.addcmul(starts, depth[:, None], directions.index_select(0, ray))
+    points = torch.cat([scans.ends[rays[hits]], free])
     labels = torch.zeros(len(points), device=points.device)
     labels[: len(hits)] = 1
     return Samples(points, labels, torch.cat([rays[hits], rays[ray]]), dropped)
@@ -137,3 +140,32 @@ def _free_depths(
     back = share * (config.near_reach - config.near_margin)
     near_depth = (free_end[near] - back).clamp(min=0)
     return torch.cat([ray, near]), torch.cat([depth, near_depth])
+
+
+def check_samples(
+    points: Tensor, labels: Tensor, dim: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not."""
+    points = torch.as_tensor(points, device=device).detach()
+    labels = torch.as_tensor(labels, device=device).detach()
+    if points.ndim != 2 or points.shape[1] != dim:
+        raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
+    if labels.shape != points.shape[:1]:
+        raise ValueError(
+            f"labels must be ({len(points)},), one per point; got {tuple(labels.shape)}"
+        )
+    if len(points) == 0:
+        raise ValueError("points must hold at least one point; got 0")
+    # the sum is much faster than asking every coordinate, and not finite if one of them is not
+    bad = points.new_zeros(0) if bool(points.sum().isfinite()) else ~points.isfinite().all(dim=1)
+    if bool(bad.any()):
+        raise ValueError(
+            f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
+            f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
+        )
+    wrong = (labels != 0) & (labels != 1)
+    if bool(wrong.any()):
+        value = labels[wrong][0].item()
+        cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
+        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
+    return points, labels

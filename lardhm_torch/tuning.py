@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from lardhm_torch import native
 from lardhm_torch.fitting import balance_classes, logistic_loss
-from lardhm_torch.hilbert_map import LardHilbertMap, check_samples
+from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.sampling import check_samples
 
 WARM_UP_STEPS = 20  # over which the rates rise to their full value
 
