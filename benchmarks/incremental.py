@@ -7,7 +7,7 @@ python benchmarks/incremental.py --only speed growth
 from __future__ import annotations
 
 import argparse
-import resource
+import copy
 import statistics
 import sys
 import time
@@ -194,33 +194,34 @@ def speed(arguments: argparse.Namespace) -> list[Row]:
 
 
 def growth(arguments: argparse.Namespace) -> list[Row]:
-    """One scan more on a straight drive of 1000 scans, 1 m apart, with and without forgetting."""
-    rows = []
+    """The next scans of a straight drive, 1 m apart, after 10, 100 and 1000 of them, timed in turn."""
+    rows: list[Row] = []
     for radius in (None, 60.0):
-        model, times = LardHilbertMap(), []
-        for number in tqdm(range(1_010), "drive", disable=None):
-            scan = street_scan(float(number), 20_000, seed=number)
-            config = StreamConfig(radius=radius, seed=number)
-            times.append(seconds_of(partial(stream_scans, model, [scan], config)))
-            if number + 1 in (20, 110, 510, 1_010):
-                held = sum(
-                    t.numel() * t.element_size() for t in (*model.parameters(), *model.buffers())
-                )
-                rows.append(
-                    {
-                        "radius": str(radius),
-                        "scans": number + 1,
-                        "ms a scan": 1e3 * statistics.median(times[-15:]),
-                        "clusters": len(model),
-                        "map MB": held / 1e6,
-                        "peak of the process MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-                        / 1e3,
-                    }
-                )
-        drive = [row for row in rows if row["radius"] == str(radius)]
-        for row in drive:
-            row["ratio"] = row["ms a scan"] / drive[0]["ms a scan"]
+        model, kept = LardHilbertMap(), {}
+        for number in tqdm(range(1_000), "drive", disable=None):
+            drive_on(model, number, radius)
+            if number + 1 in (10, 100, 1_000):
+                kept[number + 1] = copy.deepcopy(model)
+        sizes = {scans: len(model) for scans, model in kept.items()}
+        times: dict[int, list[float]] = {scans: [] for scans in kept}
+        for turn in range(15):
+            for scans, model in kept.items():
+                times[scans].append(seconds_of(partial(drive_on, model, scans + turn, radius)))
+        first = statistics.median(times[10][1:])
+        for scans, model in kept.items():
+            median = statistics.median(times[scans][1:])
+            row: Row = {"forgets beyond m": radius or "never", "scans": scans}
+            row |= {"ms a scan": 1e3 * median, "ratio to the 10th": median / first}
+            tensors = (*model.parameters(), *model.buffers())
+            held = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+            rows.append(row | {"clusters": sizes[scans], "map MB": held / 1e6})
     return rows
+
+
+def drive_on(model: LardHilbertMap, number: int, radius: float | None) -> None:
+    """One scan more; its simulation is part of the time, and the same everywhere."""
+    scan = street_scan(float(number), 20_000, seed=number)
+    stream_scans(model, [scan], StreamConfig(radius=radius, seed=number))
 
 
 def fading(arguments: argparse.Namespace) -> list[Row]:

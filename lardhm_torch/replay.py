@@ -18,6 +18,7 @@ from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, fit_weights, training_order
 from lardhm_torch.map_state import MapState
 
+MIN_PASSES = 3  # free points that it takes: single ones come from noise in range and pose
 INSIDE = (
     0.011  # kernel value at three standard deviations: a free point nearer contradicts a cluster
 )
@@ -100,12 +101,13 @@ def remembered_strength(known: MapState, new: Evidence, memory: float, floor: fl
     owner, value = native.nearest_features(new.points, own.means, raw, one, index)
     inside = value.squeeze(1) > INSIDE
     owner, kinds = owner.squeeze(1)[inside].long(), new.is_occupied[inside]
-    # in units of hits: both classes have the same total
-    worth = new.strength[inside] * torch.where(kinds, 1.0, share / (1 - share))
-    hits = torch.zeros_like(own.weights).index_add_(0, owner[kinds], worth[kinds])
-    passes = torch.zeros_like(own.weights).index_add_(0, owner[~kinds], worth[~kinds])
+    counts = new.strength[inside]
+    hits = torch.zeros_like(own.weights).index_add_(0, owner[kinds], counts[kinds])
+    passes = torch.zeros_like(own.weights).index_add_(0, owner[~kinds], counts[~kinds])
+    worth = passes * share / (1 - share)  # in units of hits: both classes have the same total
     held = strength[occupied]
-    return strength.index_copy(0, occupied, torch.where(passes > hits, held.minimum(passes), held))
+    denied = (worth > hits) & (passes >= MIN_PASSES)
+    return strength.index_copy(0, occupied, torch.where(denied, held.minimum(worth), held))
 
 
 def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator) -> Tensor:

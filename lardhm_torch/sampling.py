@@ -117,8 +117,10 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     hits = is_hit.nonzero().squeeze(1)
     # the starts of a single scan are one point: gathering them for every sample takes longest
     starts = scans.origins[:1] if scans.num_scans == 1 else origins.index_select(0, ray)
-    free = torch.addcmul(starts, depth[:, None], directions.index_select(0, ray))
-    points = torch.cat([scans.ends[rays[hits]], free])
+    points = origins.new_empty(len(hits) + len(ray), scans.dim)
+    points[: len(hits)] = scans.ends[rays[hits]]
+    ahead = directions.index_select(0, ray)
+    torch.addcmul(starts, depth[:, None], ahead, out=points[len(hits) :])
     labels = torch.zeros(len(points), device=points.device)
     labels[: len(hits)] = 1
     return Samples(points, labels, torch.cat([rays[hits], rays[ray]]), dropped)
@@ -132,9 +134,11 @@ def _free_depths(
     strata = (free_end / config.free_spacing).round().long().clamp(min=1) * first
     ray = torch.repeat_interleave(strata)
     before = strata.cumsum(0) - strata
-    step = torch.arange(len(ray), device=device) - before[ray]
-    share = torch.rand(len(ray), generator=rng, device=device, dtype=free_end.dtype)
-    depth = (step + share) / strata[ray] * free_end[ray]
+    # in place: on a full scan every array here is a million samples long
+    depth = torch.rand(len(ray), generator=rng, device=device, dtype=free_end.dtype)
+    depth += torch.arange(len(ray), device=device)
+    depth -= before.index_select(0, ray)
+    depth *= (free_end / strata.clamp(min=1)).index_select(0, ray)
     near = is_hit.nonzero().squeeze(1).repeat(config.near_samples)
     share = torch.rand(len(near), generator=rng, device=device, dtype=free_end.dtype)
     back = share * (config.near_reach - config.near_margin)

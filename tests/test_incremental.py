@@ -367,9 +367,9 @@ def test_an_obstacle_that_rays_pass_through_fades_within_a_few_scans():
     scans = 0
     while (model(there) > 0.5).double().mean() > 0.05:
         assert scans < 10
-        open_space = torch.rand(1200, 3, generator=rng, dtype=F64) * 2
+        open_space = torch.rand(6000, 3, generator=rng, dtype=F64) * 2
         points = torch.cat([beyond[:600], open_space])
-        model.update(points, torch.cat([labels[:600], torch.zeros(1200)]), seed=scans)
+        model.update(points, torch.cat([labels[:600], torch.zeros(6000)]), seed=scans)
         scans += 1
     assert scans >= 1
     assert (model(beyond[:600]) > 0.5).double().mean() > 0.9
