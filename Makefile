@@ -40,3 +40,4 @@ bench: .venv/bench
 
 soak: .venv/ready
 	$(BIN)/python scripts/fuzz_readers.py
+	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0

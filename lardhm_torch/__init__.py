@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lardhm_torch.fitting import FitConfig
     from lardhm_torch.hilbert_map import LardHilbertMap
-    from lardhm_torch.io import load_scans, save_scans
+    from lardhm_torch.incremental import UpdateConfig
+    from lardhm_torch.io import iter_scans, load_scans, save_scans
+    from lardhm_torch.joining import merge_maps
+    from lardhm_torch.map_state import resize_optimizer
     from lardhm_torch.meshing import extract_mesh
     from lardhm_torch.querying import grid
     from lardhm_torch.rays import raycast
     from lardhm_torch.sampling import Samples, SamplingConfig, sample_rays
     from lardhm_torch.scans import Scans, split_rays
     from lardhm_torch.simulation import simulate_room
+    from lardhm_torch.streaming import StreamConfig, resume_stream, stream_scans
     from lardhm_torch.tuning import TuneConfig, fine_tune
 
 _ROOM_OF = {
@@ -23,16 +27,23 @@ _ROOM_OF = {
     "Samples": "sampling",
     "SamplingConfig": "sampling",
     "Scans": "scans",
+    "StreamConfig": "streaming",
     "TuneConfig": "tuning",
+    "UpdateConfig": "incremental",
     "extract_mesh": "meshing",
     "fine_tune": "tuning",
     "grid": "querying",
+    "iter_scans": "io",
     "load_scans": "io",
+    "merge_maps": "joining",
     "raycast": "rays",
+    "resize_optimizer": "map_state",
+    "resume_stream": "streaming",
     "sample_rays": "sampling",
     "save_scans": "io",
     "simulate_room": "simulation",
     "split_rays": "scans",
+    "stream_scans": "streaming",
 }
 
 __all__ = [
@@ -41,16 +52,23 @@ __all__ = [
     "Samples",
     "SamplingConfig",
     "Scans",
+    "StreamConfig",
     "TuneConfig",
+    "UpdateConfig",
     "extract_mesh",
     "fine_tune",
     "grid",
+    "iter_scans",
     "load_scans",
+    "merge_maps",
     "raycast",
+    "resize_optimizer",
+    "resume_stream",
     "sample_rays",
     "save_scans",
     "simulate_room",
     "split_rays",
+    "stream_scans",
 ]
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from lardhm_torch.files import replaced_file
 
 FORMAT_VERSION = 1
+STREAM_KEY = "_stream"  # beside a map's tensors: how much of a stream of scans is in it
 
 
 def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:

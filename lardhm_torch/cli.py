@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +53,11 @@ def fit(arguments: argparse.Namespace) -> None:
     from lardhm_torch import LardHilbertMap, fine_tune, sample_rays
     from lardhm_torch.checkpoint import load_state, save_state
 
+    if arguments.incremental:
+        _fit_incrementally(arguments)
+        return
+    if arguments.resume or arguments.radius is not None:
+        raise ValueError("--resume and --radius belong to --incremental, which is not given")
     scans = _load_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
     _report_dropped(samples.dropped)
@@ -76,6 +82,49 @@ def fit(arguments: argparse.Namespace) -> None:
     hits = int(samples.labels.sum())
     print(
         f"{hits} hits and {len(samples) - hits} free points -> {len(model)} clusters "
+        f"-> {arguments.output}"
+    )
+
+
+def _fit_incrementally(arguments: argparse.Namespace) -> None:
+    """One scan after the other, with checkpoints in the output file."""
+    import itertools
+
+    from lardhm_torch import LardHilbertMap, StreamConfig, resume_stream, stream_scans
+
+    if arguments.tune:
+        raise ValueError("--tune needs all scans at once; leave out --incremental")
+    config = StreamConfig(
+        num_clusters=arguments.clusters,
+        radius=arguments.radius,
+        checkpoint_every=arguments.checkpoint_every,
+        seed=arguments.seed,
+    )
+    scans = _iter_scans(arguments)
+    if arguments.resume:
+        model, done = resume_stream(arguments.output)
+    else:
+        first = next(scans)
+        scans, done = itertools.chain([first], scans), None
+        settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
+        model = LardHilbertMap(first.dim, **settings)
+    seen = stream_scans(model, scans, config, path=arguments.output, done=done, progress=True)
+    print(f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}")
+
+
+def update(arguments: argparse.Namespace) -> None:
+    """More scans into a map, one after the other."""
+    from lardhm_torch import LardHilbertMap, StreamConfig, stream_scans
+
+    model = LardHilbertMap.load(arguments.map)
+    config = StreamConfig(
+        num_clusters=arguments.clusters, radius=arguments.radius, seed=arguments.seed
+    )
+    before = len(model)
+    seen = stream_scans(model, _iter_scans(arguments, model.dim), config, progress=True)
+    model.save(arguments.output)
+    print(
+        f"{seen.scans} scans, {seen.rays} rays -> {before} clusters became {len(model)} "
         f"-> {arguments.output}"
     )
 
@@ -212,16 +261,32 @@ def info(arguments: argparse.Namespace) -> None:
 def _load_scans(arguments: argparse.Namespace, dim: int | None = None) -> Scans:
     """The scans named on the command line, without z where ``--dim 2`` or a 2-D map asks for it."""
     from lardhm_torch import load_scans
+
+    scans = load_scans(arguments.scans, **_reading(arguments))
+    return _with_dim(scans, arguments, dim)
+
+
+def _iter_scans(arguments: argparse.Namespace, dim: int | None = None) -> Iterator[Scans]:
+    """The same, one after the other."""
+    from lardhm_torch import iter_scans
+
+    for scan in iter_scans(arguments.scans, **_reading(arguments)):
+        yield _with_dim(scan, arguments, dim)
+
+
+def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How the files are to be read."""
     from lardhm_torch.io import Camera
 
-    camera = Camera(intrinsics=arguments.camera, pixel_step=arguments.pixel_step)
-    scans = load_scans(
-        arguments.scans,
-        arguments.origin,
-        frame=arguments.frame,
-        topic=arguments.topic,
-        camera=camera,
-    )
+    return {
+        "origin": arguments.origin,
+        "frame": arguments.frame,
+        "topic": arguments.topic,
+        "camera": Camera(intrinsics=arguments.camera, pixel_step=arguments.pixel_step),
+    }
+
+
+def _with_dim(scans: Scans, arguments: argparse.Namespace, dim: int | None) -> Scans:
     dim = getattr(arguments, "dim", None) or dim or scans.dim
     if dim == scans.dim - 1:
         return scans.drop_constant_column()
@@ -278,11 +343,25 @@ def _scan_verbs(verb: Any) -> None:
         metavar="FILE",
         help="--tune, saved after every epoch; continued if it exists",
     )
+    sub.add_argument("--incremental", action="store_true", help="one scan after the other")
+    sub.add_argument("--resume", action="store_true", help="go on from the checkpoint in FILE")
+    sub.add_argument(
+        "--checkpoint-every", type=int, default=1, metavar="N", help="scans between two (1)"
+    )
+    _radius(sub)
     sub.add_argument("--dim", type=int, help="2 drops a constant last column")
     _seed(sub)
 
 
 def _map_verbs(verb: Any) -> None:
+    sub = verb(update)
+    sub.add_argument("map")
+    _scans(sub)
+    _output(sub)
+    sub.add_argument("--clusters", type=int, help="of a scan in an unknown place (from the data)")
+    _radius(sub)
+    _seed(sub)
+
     sub = verb(query)
     sub.add_argument("map")
     sub.add_argument("points", help=".npy or .npz of (N, D), or any scan file")
@@ -361,6 +440,12 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 def _output(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-o", "--output", required=True, metavar="FILE")
+
+
+def _radius(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--radius", type=float, metavar="METERS", help="forget what is farther from the sensor"
+    )
 
 
 def _seed(sub: argparse.ArgumentParser) -> None:

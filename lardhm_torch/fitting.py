@@ -106,6 +106,7 @@ def fit_weights(
     weights: Tensor,
     config: FitConfig,
     progress: bool = False,
+    factors: Tensor | None = None,
 ) -> Tensor:
     """Weights that minimize the regularized loss, from the given start.
 
@@ -121,14 +122,16 @@ def fit_weights(
         weights: (M,) start, left as it is.
         config: passes, rates and regularizer.
         progress: show a bar on a terminal.
+        factors: (N,) what each point's loss counts, mean 1; None: as the config says.
 
     Returns:
         (M,) weights.
 
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
-    share = config.occupied_share
-    factors = balance_classes(labels, share) if config.balance else torch.ones_like(labels)
+    if factors is None:
+        share = config.occupied_share
+        factors = balance_classes(labels, share) if config.balance else torch.ones_like(labels)
     batch_size = config.rows_a_batch(len(labels))
     plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lardhm_torch import checkpoint, native, uncertainty
+from lardhm_torch import checkpoint, joining, map_state, native, uncertainty
 from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, fit_weights, training_order
-
-CHECK_CHUNK = 1 << 18  # points checked at a time: the check takes no memory to speak of
+from lardhm_torch.incremental import Task, UpdateConfig, updated
+from lardhm_torch.sampling import check_samples
 
 
 class LardHilbertMap(nn.Module):
@@ -88,7 +88,7 @@ class LardHilbertMap(nn.Module):
         self.register_load_state_dict_pre_hook(uncertainty.fill_missing)
         self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
         self._index = torch.empty(0, dtype=torch.uint8)
-        self.register_load_state_dict_pre_hook(_make_room)
+        self.register_load_state_dict_pre_hook(map_state.make_room)
 
     # --- what the map knows ---
 
@@ -257,8 +257,7 @@ class LardHilbertMap(nn.Module):
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
         points, labels = check_samples(points, labels, self.dim, self.origin.device)
-        if num_clusters is not None and num_clusters < 1:
-            raise ValueError(f"num_clusters must be 1 or more, or None; got {num_clusters}")
+        _check_num_clusters(num_clusters)
         dtype = self.centers.dtype
         rng = torch.Generator(device=points.device).manual_seed(seed)
         origin = points.mean(dim=0, dtype=torch.float64).round()
@@ -300,6 +299,93 @@ class LardHilbertMap(nn.Module):
         self.posterior_variances = variances
         return self
 
+    def update(
+        self,
+        points: Tensor,
+        labels: Tensor,
+        num_clusters: int | None = None,
+        *,
+        seed: int = 0,
+        config: UpdateConfig | None = None,
+    ) -> LardHilbertMap:
+        """Learn from one more scan and keep what is known; on an empty map the same as `fit`.
+
+        New points join the clusters that explain them, the others make new ones; then the weights
+        near the scan are trained on the new points and on what the map recalls. Parameters stay
+        the same objects (see `map_state.resize_optimizer` for an optimizer with a state). If
+        anything fails, the map is as it was.
+
+        Args:
+            points: (N, D) world positions [m]; none leave the map as it is.
+            labels: (N,) 1 occupied, 0 free.
+            num_clusters: total over both classes if the map knew nothing yet; points that are
+                explained already make none. None: chosen from the data.
+            seed: of clustering and training.
+            config: `UpdateConfig(as_in_paper=True, replay=0)` is the paper's own rule.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1.
+
+        Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
+        """
+        if len(points) == 0 and len(labels) == 0:
+            return self
+        if len(self) == 0:
+            return self.fit(points, labels, num_clusters, seed=seed)
+        points, labels = check_samples(points, labels, self.dim, self.origin.device)
+        _check_num_clusters(num_clusters)
+        rng = torch.Generator(device=points.device).manual_seed(seed)
+        task = Task(self.kernel, config or UpdateConfig(), rng)
+        local = self._to_map_frame(points)
+        state = map_state.read_state(self)
+        state = updated(state, local, labels.to(local.dtype), num_clusters, task)
+        map_state.write_state(self, state)
+        return self
+
+    def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
+        """Move the map: what was said of x is now said of rotation x + translation.
+
+        Exact, without training: a loop closure moves a submap to where it belongs.
+
+        Args:
+            rotation: (D, D) orthonormal, determinant 1.
+            translation: (D,) [m].
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: wrong shapes, or rotation is not a rotation.
+        """
+        state, origin = joining.moved(
+            map_state.read_state(self), self.origin, rotation, translation
+        )
+        map_state.write_state(self, state)
+        self.origin = origin
+        return self
+
+    def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
+        """Forget all clusters farther than ``radius`` [m] from a world position (D,).
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: center is not (D,) and finite, or radius is not > 0.
+        """
+        center = torch.as_tensor(center, dtype=torch.float64, device=self.origin.device)
+        if center.shape != self.origin.shape or not bool(center.isfinite().all()):
+            raise ValueError(f"center must be ({self.dim},) and finite; got {center.tolist()}")
+        if not radius > 0:
+            raise ValueError(f"radius must be > 0 m; got {radius}")
+        state = map_state.read_state(self)
+        local = self._to_map_frame(center)
+        map_state.write_state(self, joining.within(state, local, radius))
+        return self
+
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
         """Groups for an optimizer, with weight decay on the weights alone.
 
@@ -328,7 +414,7 @@ class LardHilbertMap(nn.Module):
     def _grow(self, clusters: Clusters, is_occupied: Tensor, origin: Tensor) -> None:
         """Take over clusters as centers and length-scales, with weights of 0."""
         factors = factor_covariances(clusters.covariances, self.min_lengthscale)
-        _resize(self, len(clusters))
+        map_state.resize(self, len(clusters))
         with torch.no_grad():
             self.weights.zero_()
             self.centers.copy_(clusters.means)
@@ -353,7 +439,7 @@ class LardHilbertMap(nn.Module):
         return {"format_version": checkpoint.FORMAT_VERSION, **self.settings}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Nothing to set: `_make_room` has checked that the settings agree."""
+        """Nothing to set: `map_state.make_room` has checked that the settings agree."""
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map to a file, atomically: `torch.save(model.state_dict(), path)`, but safe."""
@@ -368,6 +454,7 @@ class LardHilbertMap(nn.Module):
             ValueError: the file is not a map, is damaged, unsafe, or of a newer format.
         """
         state = checkpoint.load_state(path)
+        state.pop(checkpoint.STREAM_KEY, None)  # a checkpoint of a stream is a map, too
         try:
             settings = checkpoint.check_settings(state.get("_extra_state"))
             if state["centers"].shape[1:] != (settings["dim"],):
@@ -398,70 +485,6 @@ def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
     return (points.to(working) - origin.to(working)).to(dtype)
 
 
-def check_samples(
-    points: Tensor, labels: Tensor, dim: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not."""
-    points = torch.as_tensor(points, device=device).detach()
-    labels = torch.as_tensor(labels, device=device).detach()
-    if points.ndim != 2 or points.shape[1] != dim:
-        raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
-    if labels.shape != points.shape[:1]:
-        raise ValueError(
-            f"labels must be ({len(points)},), one per point; got {tuple(labels.shape)}"
-        )
-    if len(points) == 0:
-        raise ValueError("points must hold at least one point; got 0")
-    if not all(bool(chunk.isfinite().all()) for chunk in points.split(CHECK_CHUNK)):
-        bad = ~points.isfinite().all(dim=1)
-        raise ValueError(
-            f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
-            f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
-        )
-    chunks = labels.split(CHECK_CHUNK)
-    wrong = next((c[w] for c in chunks if bool((w := (c != 0) & (c != 1)).any())), None)
-    if wrong is not None:
-        value = wrong[0].item()
-        cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
-    return points, labels
-
-
-def _resize(model: LardHilbertMap, num_clusters: int) -> None:
-    """Room for another number of clusters; parameters stay the same objects, so optimizers see it."""
-    if len(model) == num_clusters:
-        return
-    for name, tensor in {**model._parameters, **model._buffers}.items():
-        if tensor is None or name == "origin":
-            continue
-        room = tensor.new_zeros(num_clusters, *tensor.shape[1:])
-        if isinstance(tensor, nn.Parameter):
-            torch.utils.swap_tensors(tensor, nn.Parameter(room, tensor.requires_grad))
-        else:
-            setattr(model, name, room)
-
-
-def _make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Before a state dict is loaded: check it whole, then take on its number of clusters."""
-    extra = checkpoint.check_settings(state.get(prefix + "_extra_state"))
-    differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
-    if differing:
-        name, (ours, theirs) = next(iter(differing.items()))
-        raise ValueError(
-            f"state_dict must be of a map with {name} = {ours}; got {theirs}. "
-            f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
-            "LardHilbertMap.load"
-        )
-    own = {**model._parameters, **model._buffers}
-    missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
-    if missing:
-        raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
-    num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
-    for name, tensor in own.items():
-        shape = tensor.shape if name == "origin" else (num_clusters, *tensor.shape[1:])
-        if state[prefix + name].shape != torch.Size(shape):
-            raise ValueError(
-                f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
-                f"got {tuple(state[prefix + name].shape)}"
-            )
-    _resize(model, num_clusters)
+def _check_num_clusters(num_clusters: int | None) -> None:
+    if num_clusters is not None and num_clusters < 1:
+        raise ValueError(f"num_clusters must be 1 or more, or None; got {num_clusters}")

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from lardhm_torch.scans import Scans
 
+CHECK_CHUNK = 1 << 18  # labels checked at a time: the check takes no memory to speak of
+
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig:
@@ -86,7 +88,7 @@ def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str,
 def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
     """Labelled points of the scans: every hit occupied, points on the ray before it free.
 
-    Each ray is cut into stretches of about ``free_spacing`` and gives one uniform point in each
+    Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
     longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
     returns of a pulse (``target_index`` > 1) give a hit but no free space.
@@ -115,7 +117,12 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     rng = torch.Generator(device=ranges.device).manual_seed(seed)
     ray, depth = _free_depths(free_end, is_hit & first, config, rng, first)
     hits = is_hit.nonzero().squeeze(1)
-    points = torch.cat([scans.ends[rays[hits]], origins[ray] + depth[:, None] * directions[ray]])
+    # the starts of a single scan are one point: gathering them for every sample takes longest
+    starts = scans.origins[:1] if scans.num_scans == 1 else origins.index_select(0, ray)
+    points = origins.new_empty(len(hits) + len(ray), scans.dim)
+    points[: len(hits)] = scans.ends[rays[hits]]
+    ahead = directions.index_select(0, ray)
+    torch.addcmul(starts, depth[:, None], ahead, out=points[len(hits) :])
     labels = torch.zeros(len(points), device=points.device)
     labels[: len(hits)] = 1
     return Samples(points, labels, torch.cat([rays[hits], rays[ray]]), dropped)
@@ -129,11 +136,43 @@ def _free_depths(
     strata = config.free_samples * first.long()
     ray = torch.repeat_interleave(strata)
     before = strata.cumsum(0) - strata
-    step = torch.arange(len(ray), device=device) - before[ray]
-    share = torch.rand(len(ray), generator=rng, device=device, dtype=free_end.dtype)
-    depth = (step + share) / strata[ray] * free_end[ray]
+    # in place: on a full scan every array here is a million samples long
+    depth = torch.rand(len(ray), generator=rng, device=device, dtype=free_end.dtype)
+    depth += torch.arange(len(ray), device=device)
+    depth -= before.index_select(0, ray)
+    depth *= (free_end / strata.clamp(min=1)).index_select(0, ray)
     near = is_hit.nonzero().squeeze(1).repeat(config.near_samples)
     share = torch.rand(len(near), generator=rng, device=device, dtype=free_end.dtype)
     back = share * (config.near_reach - config.near_margin)
     near_depth = (free_end[near] - back).clamp(min=0)
     return torch.cat([ray, near]), torch.cat([depth, near_depth])
+
+
+def check_samples(
+    points: Tensor, labels: Tensor, dim: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not."""
+    points = torch.as_tensor(points, device=device).detach()
+    labels = torch.as_tensor(labels, device=device).detach()
+    if points.ndim != 2 or points.shape[1] != dim:
+        raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
+    if labels.shape != points.shape[:1]:
+        raise ValueError(
+            f"labels must be ({len(points)},), one per point; got {tuple(labels.shape)}"
+        )
+    if len(points) == 0:
+        raise ValueError("points must hold at least one point; got 0")
+    # The sum takes no memory, and is not finite if a coordinate is not.
+    bad = points.new_zeros(0) if bool(points.sum().isfinite()) else ~points.isfinite().all(dim=1)
+    if bool(bad.any()):
+        raise ValueError(
+            f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
+            f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
+        )
+    chunks = labels.split(CHECK_CHUNK)
+    wrong = next((c[w] for c in chunks if bool((w := (c != 0) & (c != 1)).any())), None)
+    if wrong is not None:
+        value = wrong[0].item()
+        cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
+        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
+    return points, labels

@@ -9,8 +9,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch.backpropagation import LabelledPoints, State, TuneConfig, TuningRun
-from lardhm_torch.hilbert_map import LardHilbertMap, check_samples
-from lardhm_torch.sampling import Samples
+from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.sampling import Samples, check_samples
 
 JUDGED_POINTS = 1 << 16  # whose loss is told after each epoch
 

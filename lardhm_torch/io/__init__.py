@@ -25,7 +25,7 @@ are kept: sampling drops and counts them.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -121,6 +121,28 @@ def load_scans(
     return concatenate_scans(
         [_scans_from(readout, file, origin) for file, readout in zip(files, readouts, strict=True)]
     )
+
+
+def iter_scans(
+    path: PathLike | Sequence[PathLike],
+    origin: Sequence[float] | None = None,
+    *,
+    frame: str | None = None,
+    topic: str | Sequence[str] = (),
+    camera: Camera | None = None,
+) -> Iterator[Scans]:
+    """The scans of `load_scans` one by one, each with its own origin alone.
+
+    A file is read when its turn comes, so that a folder of any length needs the memory of one file.
+
+    Args and errors: as `load_scans`; an error comes when the file's turn comes.
+    """
+    for file in expand_paths(path, _READERS, _kind_of_folder):
+        scans = load_scans(file, origin, frame=frame, topic=topic, camera=camera)
+        for number in range(scans.num_scans):
+            scan = scans.select(scans.scan_id == number)
+            origins, of_all = scans.origins[number : number + 1], torch.zeros_like(scan.scan_id)
+            yield Scans(origins, scan.ends, of_all, scan.is_return, scan.target_index)
 
 
 def save_scans(scans: Scans, path: PathLike) -> None:

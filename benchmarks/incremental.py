@@ -1,0 +1,280 @@
+"""Maps that learn scan by scan: accuracy against all scans at once, time a scan, growth, fading.
+
+python benchmarks/incremental.py                       # all parts
+python benchmarks/incremental.py --only speed growth
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from conditions import ROOT, conditions, describe, write_json
+from drive import street_scan
+from timing import format_rows
+from tqdm import tqdm
+
+from lardhm_torch import (
+    FitConfig,
+    LardHilbertMap,
+    Scans,
+    StreamConfig,
+    UpdateConfig,
+    load_scans,
+    sample_rays,
+    split_rays,
+    stream_scans,
+)
+from lardhm_torch.baselines.octomap import new_tree, to_array
+from lardhm_torch.clustering import cluster_points, concatenate_clusters
+from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch.streaming import real_time
+
+SETS = (
+    "paper_virtual",
+    "la3dm_sim_structured",
+    "tdtk_dat",
+    "balm_realworld",
+    "kitti00_mulls",
+    "sevenscenes_rgbd",
+)
+PAPER = UpdateConfig(as_in_paper=True, replay=0)
+Row = dict[str, Any]
+
+
+def single_scans(scans: Scans) -> list[Scans]:
+    """One Scans each, with its own origin alone, as they come from files."""
+    return [
+        Scans(scans.origins[number : number + 1], part.ends, None, part.is_return)
+        for number in scans.scan_id.unique().tolist()
+        if len(part := scans.select(scans.scan_id == number))
+    ]
+
+
+def streamed(scans: Iterable[Scans], config: StreamConfig) -> LardHilbertMap:
+    model = LardHilbertMap()
+    stream_scans(model, scans, config)
+    return model
+
+
+def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
+    """All scans at once, with a given number of clusters of each class."""
+    samples, rng = sample_rays(train), torch.Generator().manual_seed(0)
+    model = LardHilbertMap()
+    origin = samples.points.mean(dim=0).round()
+    local, labels = (samples.points - origin).float(), samples.labels
+    parts = [
+        cluster_points(local[labels > 0.5], occupied, rng),
+        cluster_points(local[labels <= 0.5], free, rng),
+    ]
+    clusters = concatenate_clusters(parts)
+    model._grow(clusters, torch.arange(len(clusters)) < len(parts[0]), origin)
+    model._train_weights(local, labels, FitConfig(), rng, False)
+    return model
+
+
+def accuracy(arguments: argparse.Namespace) -> list[Row]:
+    """Held-out rays: a stream in three orders against all scans at once, as many clusters."""
+    rows = []
+    for name in tqdm(arguments.sets, "accuracy", disable=None):
+        rays = protocol_rays(load_scans(arguments.data / name / "scans.npz"), 120_000)
+        train, test = split_rays(rays, 0.5)
+        scans = single_scans(train)
+        shuffled = torch.randperm(len(scans), generator=torch.Generator().manual_seed(0)).tolist()
+        orders = {
+            "given": scans,
+            "reversed": scans[::-1],
+            "random": [scans[number] for number in shuffled],
+        }
+        for order, stream in orders.items():
+            model = streamed(stream, StreamConfig())
+            occupied = int(model.is_occupied.sum())
+            batch = batch_map(train, occupied, len(model) - occupied)
+            ours, theirs = evaluate(model, test), evaluate(batch, test)
+            row: Row = {"set": name, "scans": len(scans), "order": order}
+            row["clusters"] = f"{occupied} + {len(model) - occupied}"
+            for kind in ("unif", "near"):
+                score = [table[kind]["balanced_accuracy"] for table in (ours, theirs)]
+                row[kind], row[f"{kind} batch"] = score
+                row[f"{kind} lost"] = score[1] - score[0]
+            rows.append(row)
+    return rows
+
+
+def revisits(arguments: argparse.Namespace) -> list[Row]:
+    """Clusters as one place is seen again with other rays and another seed, eleven times."""
+    rows = []
+    for name in tqdm(arguments.sets, "revisits", disable=None):
+        scans = protocol_rays(load_scans(arguments.data / name / "scans.npz"))
+        order = torch.randperm(len(scans), generator=torch.Generator().manual_seed(0))
+        visits = [scans.select(rays) for rays in order.chunk(11)]
+        for rule, config in {"default": UpdateConfig(), "Algorithm 2": PAPER}.items():
+            sizes, model = [], LardHilbertMap()
+            for seed, visit in enumerate(visits):
+                samples = sample_rays(visit, seed=seed)
+                model.update(samples.points, samples.labels, seed=seed, config=config)
+                sizes.append(len(model))
+            row = {"set": name, "rule": rule, "rays a visit": len(visits[0]), "first": sizes[0]}
+            rows.append(
+                row
+                | {
+                    "revisit +%": 100 * (sizes[1] / sizes[0] - 1),
+                    "ten +%": 100 * (sizes[10] / sizes[0] - 1),
+                }
+            )
+    return rows
+
+
+def seconds_of(run: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def learn_job(
+    model: LardHilbertMap, scans: list[Scans], config: StreamConfig
+) -> Callable[[int], Any]:
+    """Learn scan ``turn`` of a stream that starts over when it ends."""
+    return lambda turn: stream_scans(
+        model,
+        [scans[turn % len(scans)]],
+        StreamConfig(**{**vars(config), "seed": turn}),
+    )
+
+
+def octomap_job(scans: list[Scans]) -> Callable[[int], Any]:
+    tree = new_tree(0.1)
+    arrays = [(to_array(scan.ends), to_array(scan.origins[0])) for scan in scans]
+    return lambda turn: tree.insertPointCloud(*arrays[turn % len(arrays)])
+
+
+def speed(arguments: argparse.Namespace) -> list[Row]:
+    """Rays in memory to learned: the map, its real-time setting and OctoMap at 0.1 m, in turn."""
+    rows = []
+    for name in ("kitti00_mulls", "sevenscenes_rgbd"):
+        rays = protocol_rays(load_scans(arguments.data / name / "scans.npz"))
+        train, test = split_rays(rays, 0.98)
+        scans = single_scans(train)
+        settings = {"default": StreamConfig(), "real time": real_time()}
+        models = {system: LardHilbertMap() for system in settings}
+        jobs = {
+            system: learn_job(models[system], scans, config) for system, config in settings.items()
+        }
+        jobs["OctoMap 0.1 m"] = octomap_job(scans)
+        seconds: dict[str, list[float]] = {system: [] for system in jobs}
+        for turn in range(max(len(scans), 9)):
+            for system, job in jobs.items():
+                seconds[system].append(seconds_of(partial(job, turn)))
+        slowest = statistics.median(seconds["OctoMap 0.1 m"][1:])
+        for system, times in seconds.items():
+            median = statistics.median(times[1:])
+            row: Row = {"set": name, "system": system, "rays": len(scans[0])}
+            row |= {"ms a scan": 1e3 * median, "first ms": 1e3 * times[0]}
+            row["x faster than OctoMap"] = slowest / median
+            if system in models:
+                table = evaluate(models[system], test)
+                row |= {kind: table[kind]["balanced_accuracy"] for kind in ("unif", "near")}
+                row |= {"clusters": len(models[system])}
+                scan, sampling = scans[0], settings[system].sampling
+                kept = settings[system].max_rays or len(scan)
+                row["samples"] = len(
+                    sample_rays(scan.select(torch.arange(min(kept, len(scan)))), sampling)
+                )
+            rows.append(row)
+    columns = {column: None for row in rows for column in row}
+    return [{column: row.get(column, "") for column in columns} for row in rows]
+
+
+def growth(arguments: argparse.Namespace) -> list[Row]:
+    """The next scans of a straight drive, 1 m apart, after 10, 100 and 1000 of them, timed in turn."""
+    rows: list[Row] = []
+    for radius in (None, 60.0):
+        model, kept = LardHilbertMap(), {}
+        for number in tqdm(range(1_000), "drive", disable=None):
+            drive_on(model, number, radius)
+            if number + 1 in (10, 100, 1_000):
+                kept[number + 1] = copy.deepcopy(model)
+        sizes = {scans: len(model) for scans, model in kept.items()}
+        times: dict[int, list[float]] = {scans: [] for scans in kept}
+        for turn in range(15):
+            for scans, model in kept.items():
+                times[scans].append(seconds_of(partial(drive_on, model, scans + turn, radius)))
+        first = statistics.median(times[10][1:])
+        for scans, model in kept.items():
+            median = statistics.median(times[scans][1:])
+            row: Row = {"forgets beyond m": radius or "never", "scans": scans}
+            row |= {"ms a scan": 1e3 * median, "ratio to the 10th": median / first}
+            tensors = (*model.parameters(), *model.buffers())
+            held = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+            rows.append(row | {"clusters": sizes[scans], "map MB": held / 1e6})
+    return rows
+
+
+def drive_on(model: LardHilbertMap, number: int, radius: float | None) -> None:
+    """One scan more; its simulation is part of the time, and the same everywhere."""
+    scan = street_scan(float(number), 20_000, seed=number)
+    stream_scans(model, [scan], StreamConfig(radius=radius, seed=number))
+
+
+def fading(arguments: argparse.Namespace) -> list[Row]:
+    """A box of 1 m stands for some scans, then it is gone: scans until its place is free."""
+    lower = torch.tensor([10.0, -1.0, 0.2], dtype=torch.float64)
+    box = (lower, lower + 1.0)
+    rows = []
+    for stood in (1, 10, 100):
+        model = LardHilbertMap()
+        for seed in range(stood):
+            stream_scans(
+                model, [street_scan(0.1 * (seed % 20), 20_000, seed, box)], StreamConfig(seed=seed)
+            )
+        seen = street_scan(1.0, 20_000, 999, box)
+        on_box = ((seen.ends > box[0] - 0.1) & (seen.ends < box[1] + 0.1)).all(dim=1)
+        row: Row = {"stood for scans": stood, "hits on it": int(on_box.sum())}
+        row["occupied before"] = float((model(seen.ends[on_box]) > 0.5).double().mean())
+        for after in range(1, 31):
+            scan = street_scan(0.1 * (after % 20), 20_000, 1_000 + after)
+            stream_scans(model, [scan], StreamConfig(seed=after))
+            left = float((model(seen.ends[on_box]) > 0.5).double().mean())
+            for share in (0.5, 0.1):
+                if left <= share:
+                    row.setdefault(f"scans until {share:.0%} left", after)
+        row["left after 30"] = left
+        rows.append(row)
+    return rows
+
+
+PARTS = (accuracy, revisits, speed, growth, fading)
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--sets", nargs="+", default=list(SETS))
+    parser.add_argument("--only", nargs="+", choices=[part.__name__ for part in PARTS])
+    parser.add_argument("--json", type=Path, default=ROOT / "out" / "incremental.json")
+    arguments = parser.parse_args()
+    missing = [name for name in arguments.sets if not (arguments.data / name).is_dir()]
+    if missing:
+        sys.exit(f"--sets must be folders in {arguments.data}; missing: {missing}")
+    record: dict[str, Any] = {"conditions": conditions()}
+    print(describe(record["conditions"]), end="\n\n")
+    for part in PARTS:
+        if not arguments.only or part.__name__ in arguments.only:
+            record[part.__name__] = part(arguments)
+            title = (part.__doc__ or "").strip()
+            print(format_rows({"title": title, "rows": record[part.__name__]}), flush=True)
+            print()
+    write_json(arguments.json, record)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,258 @@
+"""One more scan into a map: Algorithm 2, and a default under which the map stops growing.
+
+Algorithm 2 clusters the new points and merges new clusters with old ones. Two partitions of one
+surface rarely put their centers within one standard deviation of each other, so a map grows with
+every visit. By default new points therefore go straight into the clusters of their class that
+explain them, and only the others are clustered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.clustering import (
+    MIN_COUNT,
+    Clusters,
+    cluster_classes,
+    cluster_points,
+    factor_covariances,
+    split_clusters,
+)
+from lardhm_torch.features import Kernel, kernel_factors, raw_factors
+from lardhm_torch.fitting import FitConfig
+from lardhm_torch.map_state import MapState
+from lardhm_torch.merging import append_clusters, merge_clusters, pool_into, take_clusters, whitened
+from lardhm_torch.replay import (
+    answer,
+    around,
+    join_evidence,
+    learn,
+    new_evidence,
+    recalled_evidence,
+    remembered_strength,
+)
+
+COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
+KERNEL_STDS = 2.0  # how far a cluster is taken to reach when those near a scan are chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdateConfig:
+    """How a new scan enters a map. Radii are in standard deviations of a cluster."""
+
+    as_in_paper: bool = False  # cluster all new points and merge by Algorithm 2
+    zeta: float = 1.0  # [m] of Algorithm 2: clusters farther apart never merge
+    radius: float = 3.0  # a point this near to the nearest center of its class joins the cluster
+    reach: float = 4.0  # nearer points make no new cluster
+    fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
+    refine: float = 1.0  # a scan with so many times the points of a cluster makes finer ones of it
+    max_points: int = 100_000  # that train the weights, at random; all points enter the clusters
+    replay: int = 16  # points recalled from an old cluster; 0: train on new points only
+    memory: float = 400.0  # a cluster's past counts at most as many points: the world may change
+    fit: FitConfig = field(default_factory=lambda: FitConfig(passes=2, l2=0.01))
+
+    def __post_init__(self) -> None:
+        if not 0 < self.radius <= self.reach:
+            raise ValueError(
+                f"radius and reach must satisfy 0 < radius <= reach; got {self.radius} "
+                f"and {self.reach}"
+            )
+        if not (self.zeta > 0 and self.fringe >= 0 and self.refine > 0 and self.memory > 0):
+            raise ValueError(
+                "zeta, refine and memory must be > 0 and fringe 0 or more; got "
+                f"{self.zeta}, {self.refine}, {self.memory} and {self.fringe}"
+            )
+        if self.max_points < 1 or self.replay < 0:
+            raise ValueError(
+                "max_points must be 1 or more and replay 0 or more; "
+                f"got {self.max_points} and {self.replay}"
+            )
+
+
+class Task(NamedTuple):
+    """What every step of an update needs beside clusters and points."""
+
+    kernel: Kernel
+    config: UpdateConfig
+    rng: torch.Generator
+
+
+def updated(
+    state: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
+) -> MapState:
+    """The map with one more scan: clusters pooled or appended, weights trained.
+
+    Only clusters near the points are read, so that the cost does not grow with the map. Old
+    clusters keep their rows; new ones come after them.
+
+    Args:
+        state: M clusters.
+        points: (N, D) new positions, map frame [m].
+        labels: (N,) 1 occupied, 0 free.
+        num_clusters: total over both classes if no point were explained yet; None: from the data.
+        task: kernel, settings, random state.
+
+    Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
+    """
+    nearby = near_points(state, points, task.kernel).nonzero().squeeze(1)
+    known = state.rows(nearby)
+    if task.config.as_in_paper:
+        new, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
+        part = merge_clusters(
+            known, new, is_occupied, task.config.zeta, task.kernel.min_lengthscale
+        )
+    else:
+        part = known
+        classes = [points_where(points, labels > 0.5), points_where(points, labels <= 0.5)]
+        totals = split_clusters([len(members) for members in classes], num_clusters)
+        for kind, members, total in zip((True, False), classes, totals, strict=True):
+            if total:
+                part = absorb(part, members, kind, total, task)
+    return state.put(nearby, replace(part, weights=_train(part, known, points, labels, task)))
+
+
+def points_where(points: Tensor, mask: Tensor) -> Tensor:
+    """``points[mask]``, twice as fast."""
+    return points.index_select(0, mask.nonzero().squeeze(1))
+
+
+def near_points(state: MapState, points: Tensor, kernel: Kernel) -> Tensor:
+    """(M,) bool: the clusters whose kernel reaches into the box around the points."""
+    reach = KERNEL_STDS * torch.linalg.vector_norm(
+        kernel_factors(state.raw_scale_tril, kernel), dim=2
+    )
+    lower, upper = points.aminmax(dim=0)
+    return ((state.centers + reach >= lower) & (state.centers - reach <= upper)).all(dim=1)
+
+
+def _train(part: MapState, known: MapState, points: Tensor, labels: Tensor, task: Task) -> Tensor:
+    """(M,) weights trained on the new points and on what the clusters around them recall."""
+    config, kernel, rng = task.config, task.kernel, task.rng
+    index = native.build_index(part.centers, kernel.num_neighbors)
+    new = new_evidence(points, labels, config.max_points, rng)
+    seen = answer(part, new, kernel, index)
+    if not config.replay or len(known) == 0:
+        return learn(part.weights, new, seen, config.fit, rng)
+    moving = around(seen.indices, part, kernel.num_neighbors)
+    rows = moving[: len(known)].nonzero().squeeze(1)
+    strength = remembered_strength(known.rows(rows), new, config.memory, kernel.min_lengthscale)
+    strength = (strength / config.replay)[:, None].expand(-1, config.replay)
+    old = recalled_evidence(known, rows, kernel, strength, rng)
+    recalled = answer(part, old, kernel, index)
+    evidence, features = join_evidence([new, old], [seen, recalled])
+    learned = learn(part.weights, evidence, features, config.fit, rng)
+    return torch.where(moving, learned, part.weights)
+
+
+def absorb(
+    part: MapState, points: Tensor, is_occupied: bool, num_clusters: int, task: Task
+) -> MapState:
+    """Points of one class pooled into the clusters that explain them; the others make new ones.
+
+    Args:
+        part: clusters nearby, of both classes.
+        points: (N, D) new points of one class [m].
+        is_occupied: which class.
+        num_clusters: how many all the points would make; the unexplained make their share.
+        task: kernel, settings, random state.
+    """
+    floor = task.kernel.min_lengthscale
+    own = (part.is_occupied == is_occupied).nonzero().squeeze(1)
+    known = part.rows(own)
+    look = _explain(known, points, len(points) / num_clusters, task)
+    pooled = (look.found.counts > 0).nonzero().squeeze(1)
+    part = pool_into(part, own[pooled], take_clusters(look.found, pooled), floor)
+    rest = points_where(points, look.unexplained)
+    if len(rest) < MIN_COUNT:
+        return part
+    share = -(-num_clusters * len(rest) // len(points))
+    new = cluster_points(rest, share, task.rng)
+    new, where = _settle(known, new, look, task)
+    kinds = torch.full((len(new),), is_occupied, device=points.device)
+    return append_clusters(part, new, kinds, floor, own[where])
+
+
+class _Look(NamedTuple):
+    """What known clusters make of new points.
+
+    ``found`` are the moments of the points that join each cluster; ``outgrown`` are the clusters
+    that are too coarse for the scan, and ``covered`` those among them that the scan saw whole.
+    """
+
+    unexplained: Tensor
+    found: Clusters
+    outgrown: Tensor
+    covered: Tensor
+
+
+def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Look:
+    config, clusters = task.config, known.clusters
+    if len(known) == 0:
+        everything = torch.ones(len(points), dtype=torch.bool, device=points.device)
+        return _Look(everything, clusters, known.is_occupied, known.is_occupied)
+    factors = factor_covariances(clusters.covariances, task.kernel.min_lengthscale)
+    index = native.build_index(clusters.means, 1)
+    raw, nearest = raw_factors(factors), Kernel(num_neighbors=1)
+    owner, value = native.nearest_features(points, clusters.means, raw, nearest, index)
+    owner, value = owner.squeeze(1), value.squeeze(1)
+    joining = points_where(points, value >= _closeness(config.radius))
+    found = _moments(joining, clusters.means)
+    outgrown = found.counts > config.refine * clusters.counts.clamp(min=2 * usual_count)
+    covered = outgrown & (_spread(found) > COVERED * _spread(clusters))
+    stays = (~outgrown).to(clusters.counts.dtype)
+    found = Clusters(found.counts * stays, found.means, found.scatters)
+    explained = (value >= _closeness(config.reach)) & ~outgrown.index_select(0, owner)
+    return _Look(~explained, found, outgrown, covered)
+
+
+def _closeness(stds: float) -> float:
+    """The kernel's value at a distance of so many standard deviations."""
+    return float(torch.exp(torch.tensor(-0.5 * stds**2)))
+
+
+def _moments(points: Tensor, centers: Tensor) -> Clusters:
+    """Moments of the points nearest to each center."""
+    _, counts, sums, scatters = native.assign(points, centers)
+    shift = sums / counts.clamp(min=1)[:, None]
+    between = counts[:, None, None] * shift[:, :, None] * shift[:, None, :]
+    return Clusters(counts.long(), centers + shift, scatters - between)
+
+
+def _spread(clusters: Clusters) -> Tensor:
+    """(M,) total variance [m^2]."""
+    total = clusters.scatters.diagonal(dim1=1, dim2=2).sum(dim=1)
+    return total / clusters.counts.clamp(min=1)
+
+
+def _settle(known: MapState, new: Clusters, look: _Look, task: Task) -> tuple[Clusters, Tensor]:
+    """Which new clusters are taken, in which order, and the rows that the first of them take over.
+
+    A new cluster that has an old center among its own points is the fringe of old ones and is left
+    out. The new clusters of a covered one share its points in proportion to their own, and one of
+    them takes over its row.
+    """
+    none = known.counts[:0]
+    if len(known) == 0:
+        return new, none
+    owner = native.nearest_centers(new.means, known.means, 1).squeeze(1)
+    offsets = known.means[owner] - new.means
+    apart = whitened(offsets, new.covariances, task.kernel.min_lengthscale) > task.config.fringe
+    kept = look.outgrown[owner] | apart
+    new, owner = take_clusters(new, kept), owner[kept]
+    heirs = look.covered[owner]
+    total = torch.zeros_like(known.counts).index_add_(0, owner, new.counts)
+    gain = torch.where(heirs, 1 + known.counts[owner] / total[owner], 1.0).to(new.means.dtype)
+    order = torch.arange(len(new), device=owner.device)
+    first = torch.full_like(known.counts, len(new)).scatter_reduce(0, owner, order, "amin")
+    where = (look.covered & (first < len(new))).nonzero().squeeze(1)
+    rest = torch.ones_like(heirs).index_fill_(0, first[where], False).nonzero().squeeze(1)
+    order = torch.cat([first[where], rest])
+    scatters = new.scatters * gain[:, None, None]
+    return take_clusters(
+        Clusters((new.counts * gain).round().long(), new.means, scatters), order
+    ), where

@@ -1,0 +1,146 @@
+"""The tensors of a map: rows, and how their number changes in place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lardhm_torch import checkpoint
+from lardhm_torch.clustering import Clusters
+
+
+def resize(model: Any, num_clusters: int) -> None:
+    """Room for another number of clusters; parameters stay the same objects, so optimizers see it."""
+    if len(model) == num_clusters:
+        return
+    for name, tensor in {**model._parameters, **model._buffers}.items():
+        if tensor is None or name == "origin":
+            continue
+        room = tensor.new_zeros(num_clusters, *tensor.shape[1:])
+        if isinstance(tensor, nn.Parameter):
+            torch.utils.swap_tensors(tensor, nn.Parameter(room, tensor.requires_grad))
+        else:
+            setattr(model, name, room)
+
+
+def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Before a state dict is loaded: check it whole, then take on its number of clusters."""
+    extra = checkpoint.check_settings(state.get(prefix + "_extra_state"))
+    differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
+    if differing:
+        name, (ours, theirs) = next(iter(differing.items()))
+        raise ValueError(
+            f"state_dict must be of a map with {name} = {ours}; got {theirs}. "
+            f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
+            "LardHilbertMap.load"
+        )
+    own = {**model._parameters, **model._buffers}
+    missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
+    if missing:
+        raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
+    num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
+    for name, tensor in own.items():
+        shape = tensor.shape if name == "origin" else (num_clusters, *tensor.shape[1:])
+        if state[prefix + name].shape != torch.Size(shape):
+            raise ValueError(
+                f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
+                f"got {tuple(state[prefix + name].shape)}"
+            )
+    resize(model, num_clusters)
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Everything a map knows but its origin: M rows each (see `LardHilbertMap`)."""
+
+    weights: Tensor
+    centers: Tensor
+    raw_scale_tril: Tensor
+    is_occupied: Tensor
+    counts: Tensor
+    means: Tensor
+    scatters: Tensor
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """The tensors, in order."""
+        return (getattr(self, field.name) for field in fields(self))
+
+    def rows(self, which: Tensor) -> MapState:
+        """The clusters of a mask or of indices, in that order, as copies."""
+        return MapState(*(tensor[which] for tensor in self))
+
+    def put(self, where: Tensor, part: MapState) -> MapState:
+        """A copy with the first rows of ``part`` in the places ``where`` and its others at the end."""
+        count = len(where)
+        return MapState(
+            *(
+                torch.cat([ours, theirs[count:]]).index_copy_(0, where, theirs[:count])
+                for ours, theirs in zip(self, part, strict=True)
+            )
+        )
+
+    def __len__(self) -> int:
+        """Number of clusters M."""
+        return self.weights.shape[0]
+
+    @property
+    def clusters(self) -> Clusters:
+        """The moments."""
+        return Clusters(self.counts, self.means, self.scatters)
+
+
+def read_state(model: Any) -> MapState:
+    """The map's own tensors, detached, not copied."""
+    return MapState(*(getattr(model, field.name).detach() for field in fields(MapState)))
+
+
+def write_state(model: Any, state: MapState) -> None:
+    """Give a map other clusters: all or, if anything fails, none.
+
+    Parameters stay the same objects, so an optimizer made before goes on (or, if it keeps a state
+    of the old size, fails loudly: see `resize_optimizer`).
+    """
+    before = MapState(*(tensor.clone() for tensor in read_state(model)))
+    try:
+        assign_state(model, state)
+    except BaseException:
+        assign_state(model, before)
+        raise
+
+
+def assign_state(model: Any, state: MapState) -> None:
+    """Copy the tensors of a state into a map, one by one; a posterior of the old weights goes."""
+    resize(model, len(state.weights))
+    model.posterior_variances.zero_()
+    with torch.no_grad():
+        for field, value in zip(fields(state), state, strict=True):
+            getattr(model, field.name).copy_(value)
+
+
+def resize_optimizer(optimizer: torch.optim.Optimizer, model: Any) -> None:
+    """Make room in an optimizer's state for the clusters that `update` appended.
+
+    An optimizer without a state per parameter (plain SGD) needs nothing after growth; Adam or
+    momentum would fail with a shape mismatch. Old rows keep their state, new ones start at 0.
+
+    Raises:
+        ValueError: the map has fewer clusters than the state: rows are gone (`crop`, `fit`) and
+            which is not known. Make a new optimizer.
+    """
+    for parameter in model.parameters():
+        for name, value in optimizer.state.get(parameter, {}).items():
+            if not isinstance(value, Tensor) or value.shape[1:] != parameter.shape[1:]:
+                continue
+            if value.ndim != parameter.ndim or len(value) == len(parameter):
+                continue
+            if len(value) > len(parameter):
+                raise ValueError(
+                    f"optimizer must hold at most {len(parameter)} clusters; its {name} holds "
+                    f"{len(value)}. Make a new optimizer after crop or fit"
+                )
+            room = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
+            optimizer.state[parameter][name] = torch.cat([value, room])

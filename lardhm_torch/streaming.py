@@ -1,0 +1,167 @@
+"""Scan after scan into a map, with checkpoints from which a killed run goes on."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from lardhm_torch import checkpoint
+from lardhm_torch.fitting import FitConfig
+from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.incremental import UpdateConfig
+from lardhm_torch.sampling import SamplingConfig, sample_rays, usable_rays
+from lardhm_torch.scans import Scans
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamConfig:
+    """How a stream of scans is learned."""
+
+    num_clusters: int | None = None  # of a scan in a place the map does not know; None: from data
+    max_rays: int | None = None  # of a scan, at random; None: all
+    radius: float | None = None  # [m] around the sensor, beyond which the map forgets; None: never
+    checkpoint_every: int = 1  # scans between two checkpoints
+    seed: int = 0  # of everything random; scan n uses seed + n
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    update: UpdateConfig = field(default_factory=UpdateConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("num_clusters", "max_rays", "radius", "checkpoint_every"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be > 0; got {value}")
+
+
+def real_time(config: StreamConfig | None = None) -> StreamConfig:
+    """The same with a third of the work: fewer rays, few free points far from surfaces.
+
+    For a full 64-beam scan ten times a second on two cores; benchmarks/incremental.py measures what
+    it costs in accuracy.
+    """
+    config = config or StreamConfig()
+    return replace(
+        config,
+        max_rays=50_000,
+        sampling=replace(config.sampling, free_samples=2, near_samples=1),
+        update=replace(
+            config.update, max_points=40_000, replay=6, fit=FitConfig(passes=2, l2=0.01)
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How much of a stream is in a map: scans taken (or passed over), and rays in them."""
+
+    scans: int = 0
+    rays: int = 0
+
+
+def stream_scans(
+    model: LardHilbertMap,
+    scans: Iterable[Scans],
+    config: StreamConfig | None = None,
+    *,
+    path: str | os.PathLike[str] | None = None,
+    done: Progress | None = None,
+    progress: bool = False,
+) -> Progress:
+    """Update a map with one scan after the other.
+
+    Every ``checkpoint_every`` scans, and at the end, the map and how many scans are in it are
+    written to ``path`` in one atomic step: a run killed at any moment goes on from there
+    (`resume_stream`) and ends with the very map of a run that was not killed.
+
+    Args:
+        model: changed in place.
+        scans: one scan each (`iter_scans`); a scan without a usable ray is passed over, with a
+            warning.
+        config: clusters, forgetting, checkpoints.
+        path: map file; None: no checkpoints.
+        done: what `resume_stream` found; so many scans are passed over.
+        progress: show a bar with the rate on a terminal.
+
+    Returns:
+        What is in the map now.
+
+    Raises:
+        ValueError: the scans are not those that ``done`` was counted in.
+    """
+    config, done = config or StreamConfig(), done or Progress()
+    seen, saved = Progress(), done
+    with tqdm(desc="scans", unit="scan", disable=None if progress else True) as bar:
+        for scan in scans:
+            number = seen.scans
+            seen = Progress(number + 1, seen.rays + len(scan))
+            if seen.scans == done.scans and seen.rays != done.rays:
+                raise ValueError(
+                    f"scans must be those of the checkpoint, {done.rays} rays in the first "
+                    f"{done.scans}; got {seen.rays}"
+                )
+            if seen.scans > done.scans:
+                _learn(model, scan, number, config)
+                if path is not None and seen.scans % config.checkpoint_every == 0:
+                    _save(model, seen, path)
+                    saved = seen
+            bar.set_postfix(clusters=len(model), refresh=False)
+            bar.update()
+    if seen.scans < done.scans:
+        raise ValueError(
+            f"scans must be those of the checkpoint, which holds {done.scans}; got {seen.scans}"
+        )
+    if path is not None and saved != seen:
+        _save(model, seen, path)
+    return seen
+
+
+def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progress]:
+    """The map of a checkpoint and how much of the stream is in it.
+
+    What a killed run left half-written beside the checkpoint is removed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not a map, or not one that a stream wrote.
+    """
+    found = checkpoint.load_state(path).get(checkpoint.STREAM_KEY)
+    if not isinstance(found, dict) or not all(
+        isinstance(found.get(name), int) for name in ("scans", "rays")
+    ):
+        raise ValueError(f"{os.fspath(path)} must be the checkpoint of a stream; it is another map")
+    model = LardHilbertMap.load(path)
+    target = Path(path)
+    leftover = re.compile(re.escape(f".{target.name}.") + r"[a-z0-9_]{8}")
+    for file in target.parent.iterdir():
+        if leftover.fullmatch(file.name):
+            file.unlink()
+    return model, Progress(found["scans"], found["rays"])
+
+
+def _save(model: LardHilbertMap, seen: Progress, path: str | os.PathLike[str]) -> None:
+    stream = {"scans": seen.scans, "rays": seen.rays}
+    checkpoint.save_state({**model.state_dict(), checkpoint.STREAM_KEY: stream}, path)
+
+
+def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig) -> None:
+    seed = config.seed + number
+    if config.max_rays is not None and len(scan) > config.max_rays:
+        rng = torch.Generator(device=scan.ends.device).manual_seed(seed)
+        rows = torch.randint(len(scan), (config.max_rays,), generator=rng, device=rng.device)
+        scan = scan.select(rows)
+    usable, dropped = usable_rays(scan, config.sampling)
+    if not bool(usable.any()):
+        warnings.warn(f"scan {number} was passed over: no usable ray; {dropped}", stacklevel=3)
+        return
+    samples = sample_rays(scan, config.sampling, seed=seed)
+    model.update(
+        samples.points, samples.labels, config.num_clusters, seed=seed, config=config.update
+    )
+    if config.radius is not None:
+        model.crop(scan.origins[0], config.radius)
