@@ -56,8 +56,10 @@ def fit(arguments: argparse.Namespace) -> None:
     if arguments.incremental:
         _fit_incrementally(arguments)
         return
-    if arguments.resume or arguments.radius is not None:
-        raise ValueError("--resume and --radius belong to --incremental, which is not given")
+    if arguments.resume or arguments.view or arguments.radius is not None:
+        raise ValueError(
+            "--resume, --view and --radius belong to --incremental, which is not given"
+        )
     scans = _load_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
     _report_dropped(samples.dropped)
@@ -108,7 +110,19 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         scans, done = itertools.chain([first], scans), None
         settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
         model = LardHilbertMap(first.dim, **settings)
-    seen = stream_scans(model, scans, config, path=arguments.output, done=done, progress=True)
+    live = None
+    if arguments.view:
+        from lardhm_torch.viewer import LiveView
+
+        live = LiveView()
+    try:
+        seen = stream_scans(
+            model, scans, config, path=arguments.output, done=done,
+            after_scan=live.update if live else None, progress=True,
+        )  # fmt: skip
+    finally:
+        if live:
+            live.close()
     print(f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}")
 
 
@@ -345,6 +359,9 @@ def _scan_verbs(verb: Any) -> None:
     )
     sub.add_argument("--incremental", action="store_true", help="one scan after the other")
     sub.add_argument("--resume", action="store_true", help="go on from the checkpoint in FILE")
+    sub.add_argument(
+        "--view", action="store_true", help="--incremental with a page of the live map"
+    )
     sub.add_argument(
         "--checkpoint-every", type=int, default=1, metavar="N", help="scans between two (1)"
     )

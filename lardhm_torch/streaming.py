@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -71,6 +71,7 @@ def stream_scans(
     *,
     path: str | os.PathLike[str] | None = None,
     done: Progress | None = None,
+    after_scan: Callable[[LardHilbertMap], None] | None = None,
     progress: bool = False,
 ) -> Progress:
     """Update a map with one scan after the other.
@@ -86,6 +87,7 @@ def stream_scans(
         config: clusters, forgetting, checkpoints.
         path: map file; None: no checkpoints.
         done: what `resume_stream` found; so many scans are passed over.
+        after_scan: called with the map after every scan it learned, for a live view say.
         progress: show a bar with the rate on a terminal.
 
     Returns:
@@ -110,6 +112,8 @@ def stream_scans(
                 if path is not None and seen.scans % config.checkpoint_every == 0:
                     _save(model, seen, path)
                     saved = seen
+                if after_scan is not None:
+                    after_scan(model)
             bar.set_postfix(clusters=len(model), refresh=False)
             bar.update()
     if seen.scans < done.scans:

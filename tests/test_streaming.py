@@ -99,6 +99,23 @@ def test_checkpoints_come_as_often_as_asked_and_at_the_end(folder, tmp_path, mon
     assert saved == [4, 8, 9]
 
 
+def test_fit_incremental_shows_the_map_after_every_scan(folder, tmp_path, monkeypatch):
+    shown = []
+
+    class Page:
+        def update(self, model):
+            shown.append(len(model))
+
+        def close(self):
+            shown.append("closed")
+
+    monkeypatch.setattr("lardhm_torch.viewer.LiveView", Page)
+    path = tmp_path / "map.pt"
+    assert main(["fit", str(folder), "-o", str(path), "--incremental", "--view"]) == 0
+    assert len(shown) == 10
+    assert shown[-2:] == [len(LardHilbertMap.load(path)), "closed"]
+
+
 def test_other_scans_than_those_of_the_checkpoint_are_refused(folder, whole):
     model, done = resume_stream(whole)
     files = sorted(folder.iterdir())
