@@ -209,7 +209,8 @@ class LardHilbertMap(nn.Module):
         if torch.compiler.is_compiling():  # no branch on values; the operators check it themselves
             return self._index
         if not native.index_matches(self._index, self.centers, self.num_neighbors):
-            self._index = native.build_index(self.centers, self.num_neighbors)
+            with torch.inference_mode(False):  # an inference tensor could never serve training
+                self._index = native.build_index(self.centers, self.num_neighbors)
         return self._index
 
     def _to_map_frame(self, points: Tensor) -> Tensor:

@@ -20,11 +20,24 @@ def resize(model: Any, num_clusters: int) -> None:
     for name, tensor in {**model._parameters, **model._buffers}.items():
         if tensor is None or name == "origin":
             continue
-        room = tensor.new_zeros(num_clusters, *tensor.shape[1:])
+        room = tensor.detach().new_zeros(num_clusters, *tensor.shape[1:])
         if isinstance(tensor, nn.Parameter):
-            torch.utils.swap_tensors(tensor, nn.Parameter(room, tensor.requires_grad))
+            _give_room(tensor, room)
         else:
             setattr(model, name, room)
+
+
+def _give_room(parameter: nn.Parameter, room: Tensor) -> None:
+    """Another shape for the same parameter, also while answers with a graph are around.
+
+    On the way through another dtype autograd forgets the old shape: new graphs get gradients of the
+    new one, and an old graph fails loudly. (`torch.utils.swap_tensors` refuses while a graph lives.)
+    """
+    parameter.grad = None
+    parameter.data = room.new_empty(
+        0, dtype=torch.float32 if room.dtype == torch.float64 else torch.float64
+    )
+    parameter.data = room
 
 
 def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:

@@ -139,6 +139,19 @@ def test_a_fit_keeps_the_parameters_the_optimizer_knows():
     assert not torch.equal(model.weights, before)
 
 
+def test_a_map_changes_size_while_an_answer_with_a_graph_is_around():
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
+    labels = (points[:, 0] > 0).float()
+    model = LardHilbertMap(num_neighbors=4).fit(points, labels, num_clusters=8)
+    before = model(points)
+    model.fit(points, labels, num_clusters=20)
+    after = model(points)
+    after.sum().backward()
+    assert model.weights.grad.shape == (len(model),)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        before.sum().backward()
+
+
 def test_save_and_load_give_the_same_map(tmp_path):
     model = wall_map(num_neighbors=7, covariance_scale=3.0)
     model.save(tmp_path / "map.pt")

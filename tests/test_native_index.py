@@ -1,5 +1,6 @@
 """The index of the search is never stale; threads and processes get their own answers."""
 
+import copy
 import multiprocessing
 import threading
 
@@ -12,6 +13,8 @@ from native_maps import (
     make_points,
 )
 from torch import Tensor
+
+from lardhm_torch import LardHilbertMap, features
 
 
 def test_a_stale_or_foreign_index_cannot_change_an_answer(ops):
@@ -116,3 +119,92 @@ def test_a_forked_child_does_not_hang(ops):
         assert queue.get() == expected
     finally:
         torch.set_num_threads(before)
+
+
+# --- a map whose centers change under it ---
+
+
+def small_map(seed: int = 0) -> LardHilbertMap:
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(seed))
+    return LardHilbertMap(num_neighbors=4).fit(points, (points[:, 0] > 0).float(), 30, seed=seed)
+
+
+def plain_answer(model: LardHilbertMap, points: Tensor) -> Tensor:
+    """By the definition, without index and kernel."""
+    local = points - model.origin.to(points)
+    state = (model.centers, model.scale_tril, model.weights, model.num_neighbors)
+    return torch.sigmoid(features.log_odds(local, *state)).detach()
+
+
+def step_of_an_optimizer(model: LardHilbertMap, points: Tensor) -> None:
+    model.centers.requires_grad_()
+    optimizer = torch.optim.SGD([model.centers], lr=5.0)
+    model.log_odds(points).sum().backward()
+    optimizer.step()
+
+
+def copy_in_place(model: LardHilbertMap, points: Tensor) -> None:
+    with torch.no_grad():
+        model.centers.copy_(model.centers.flip(0) + 0.2)
+
+
+def edit_of_data(model: LardHilbertMap, points: Tensor) -> None:
+    model.centers.data[3:9] += 0.5
+
+
+def edit_in_inference_mode(model: LardHilbertMap, points: Tensor) -> None:
+    with torch.inference_mode():
+        model.centers.data.mul_(1.3)
+
+
+def other_state(model: LardHilbertMap, points: Tensor) -> None:
+    state = small_map(seed=1).state_dict()
+    model.load_state_dict(state)
+
+
+CHANGES = [step_of_an_optimizer, copy_in_place, edit_of_data, edit_in_inference_mode, other_state]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("inference", [False, True])
+def test_a_map_answers_from_its_centers_as_they_are_now(ops, change, inference):
+    model, points = small_map(), make_points(300, 3, torch.float32)
+    with torch.inference_mode(inference):
+        before = model(points).clone()
+    change(model, points)
+    with torch.inference_mode(inference):
+        after = model(points).clone()
+    assert not torch.equal(before, after)
+    torch.testing.assert_close(after, plain_answer(model, points), rtol=1e-5, atol=1e-6)
+
+
+def test_a_map_made_in_the_place_of_a_freed_one_answers_for_itself(ops):
+    points = make_points(300, 3, torch.float32)
+    for seed in range(6):
+        model = small_map(seed)  # likely at the address of the one before
+        answer = model(points).detach()
+        torch.testing.assert_close(answer, plain_answer(model, points), rtol=1e-5, atol=1e-6)
+        del model
+
+
+def test_one_map_asked_by_two_threads_while_it_changes_answers_old_or_new(ops):
+    model, points = small_map(), make_points(2000, 3, torch.float32)
+    old = model(points).detach()
+    fresh = copy.deepcopy(model)
+    fresh.centers.data += 0.25
+    new = fresh(points).detach()
+    answers: list[Tensor] = []
+
+    def ask() -> None:
+        for _ in range(40):
+            answers.append(model(points).detach())
+
+    threads = [threading.Thread(target=ask) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    model.centers = torch.nn.Parameter(fresh.centers.detach().clone(), requires_grad=False)
+    for thread in threads:
+        thread.join(60)
+    assert len(answers) == 80
+    assert all(torch.equal(answer, old) or torch.equal(answer, new) for answer in answers)
+    assert torch.equal(model(points).detach(), new)
