@@ -187,6 +187,7 @@ def main() -> None:
     for name, path in tqdm(sets.items(), disable=None):
         record["sets"][name] = run_set(load_scans(path), systems, arguments)
         tqdm.write(format_set(name, record["sets"][name]) + "\n")
+        sys.stdout.flush()
     write_json(arguments.json, record)
 
 
