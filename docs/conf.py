@@ -36,7 +36,7 @@ def plain_text(app, what, name, obj, options, lines):
 
 def write_command_line(app) -> None:
     """The page of the command line, from the parser itself."""
-    parser = cli._parser()
+    parser = cli.make_parser()
     verbs = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     page = ["# Command line", "", parser.description or "", "", parser.epilog or "", ""]
     page += ["Exit code 0, or a one-line error and 1; 2 for a wrong command line.", ""]
