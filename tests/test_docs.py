@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import lardhm_torch
-from lardhm_torch import cli, save_scans, simulate_room
+from lardhm_torch import Scans, cli, save_scans, simulate_room
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -31,6 +31,13 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "scans").mkdir()
     save_scans(scans, tmp_path / "scans" / "one.npz")
     save_scans(scans, tmp_path / "room.npz")
+    for name in ("drive", "more"):  # scan by scan, one file each
+        (tmp_path / name).mkdir()
+        for number in range(scans.num_scans):
+            seen = scans.scan_id == number
+            place, ends = scans.origins[number][None], scans.ends[seen]
+            one = Scans(place, ends, None, scans.is_return[seen])
+            save_scans(one, tmp_path / name / f"{number}.npz")
     return tmp_path
 
 
