@@ -42,6 +42,8 @@ def made_up_map(num_clusters: int, num_neighbors: int = 5, seed: int = 0) -> Lar
     raw = torch.zeros(num_clusters, 3, 3) + torch.diag(torch.tensor([0.2, 0.2, 0.1]).log())
     state |= {
         "weights": torch.where(is_occupied, 4.0, -4.0),
+        "posterior_means": torch.zeros(num_clusters),
+        "posterior_variances": torch.zeros(num_clusters),
         "centers": centers,
         "raw_scale_tril": raw,
         "is_occupied": is_occupied,
