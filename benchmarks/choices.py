@@ -38,6 +38,13 @@ from lardhm_torch.metrics import evaluate, protocol_rays
 
 Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
 
+HEAD = """# What each choice is worth
+
+Balanced accuracy unif / near in percent and log-loss unif / near, one thing changed at a time; at most
+{rays:,} rays of a set, half of them train, seed {seed}. Written by `benchmarks/choices.py`.
+
+"""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
@@ -211,7 +218,8 @@ def main() -> None:
         print(markdown({name: results[name]}, list(sets)).splitlines()[-1], flush=True)
         write_json(arguments.json, record | {"results": results})
         if arguments.markdown:
-            arguments.markdown.write_text(markdown(results, list(sets)))
+            page = HEAD.format(rays=arguments.rays, seed=arguments.seed)
+            arguments.markdown.write_text(page + markdown(results, list(sets)))
 
 
 if __name__ == "__main__":

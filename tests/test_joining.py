@@ -143,7 +143,7 @@ def test_an_empty_map_adds_nothing():
 
 
 def test_maps_of_other_settings_are_not_merged():
-    with pytest.raises(ValueError, match=r"same settings; got .*'num_neighbors': 8.*: 5"):
+    with pytest.raises(ValueError, match=r"same settings; got .*'num_neighbors': 16.*: 5"):
         merge_maps(wall_map(), wall_map(num_neighbors=5))
 
 
