@@ -212,27 +212,12 @@ def clusters_about(centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tens
         counts: (M,) number of points.
         sums: (M, D) sum of the offsets from the center [m].
         scatters: (M, D, D) sum of their outer products [m^2].
+
+    Source: Guizilini & Ramos 2016, eq. (6), (7).
     """
     shift = sums / counts.clamp(min=1)[:, None]
     about_mean = scatters - sums[:, :, None] * shift[:, None, :]
     return Clusters(counts.long(), centers + shift, about_mean)
-
-
-def cluster_moments(points: Tensor, labels: Tensor, num_clusters: int) -> Clusters:
-    """Count, mean and scatter of the points of each label.
-
-    Source: Guizilini & Ramos 2016, eq. (6), (7).
-    """
-    counts = torch.bincount(labels, minlength=num_clusters)
-    shape = (num_clusters, points.shape[1])
-    anchor = points.new_zeros(shape).index_copy_(0, labels, points)  # any member: keeps digits
-    offsets = points - anchor[labels]
-    shift = points.new_zeros(shape).index_add_(0, labels, offsets)
-    means = anchor + shift / counts.clamp(min=1)[:, None]
-    offsets = points - means[labels]
-    outer = offsets[:, :, None] * offsets[:, None, :]
-    scatters = points.new_zeros(*shape, shape[1]).index_add_(0, labels, outer)
-    return Clusters(counts, means, scatters)
 
 
 def pool_clusters(clusters: Clusters, groups: Tensor, num_groups: int) -> Clusters:

@@ -5,10 +5,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.cluster import MiniBatchKMeans
 
+from lardhm_torch import native
 from lardhm_torch.clustering import (
+    Clusters,
     cluster_classes,
-    cluster_moments,
     cluster_points,
+    clusters_about,
     factor_covariances,
     merge_small,
     mini_batch_kmeans,
@@ -35,15 +37,27 @@ def inertia(points, centers):
     return float(squared_distances(points, centers[nearest]).sum())
 
 
-def test_moments_equal_numpy_cluster_by_cluster():
-    points = torch.randn(300, 3, dtype=F64)
-    labels = torch.randint(7, (300,))
-    clusters = cluster_moments(points, labels, 7)
+def cluster_moments(points, labels, num_clusters):
+    """Count, mean and scatter of the points of each label, one label after the other."""
+    members = [points[labels == m] for m in range(num_clusters)]
+    means = torch.stack([m.sum(dim=0) / max(1, len(m)) for m in members])
+    apart = [m - mean for m, mean in zip(members, means, strict=True)]
+    counts = torch.tensor([len(m) for m in members])
+    return Clusters(counts, means, torch.stack([offsets.T @ offsets for offsets in apart]))
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_moments_equal_numpy_cluster_by_cluster(dim):
+    points = torch.randn(300, dim, generator=rng(), dtype=F64) + 50
+    centers = points[:7] + 0.1
+    labels, *moments = native.assign(points, centers)
+    clusters = clusters_about(centers, *moments)
     for m in range(7):
         members = points[labels == m].numpy()
         assert clusters.counts[m] == len(members)
         np.testing.assert_allclose(clusters.means[m], members.mean(axis=0))
-        np.testing.assert_allclose(clusters.covariances[m], np.cov(members.T), atol=1e-12)
+        expected = np.cov(members.T) if len(members) > 1 else 0.0
+        np.testing.assert_allclose(clusters.covariances[m].squeeze(), expected, atol=1e-12)
 
 
 @settings(deadline=None, max_examples=30)
