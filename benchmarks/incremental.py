@@ -239,13 +239,15 @@ def fading(arguments: argparse.Namespace) -> list[Row]:
         on_box = ((seen.ends > box[0] - 0.1) & (seen.ends < box[1] + 0.1)).all(dim=1)
         row: Row = {"stood for scans": stood, "hits on it": int(on_box.sum())}
         row["occupied before"] = float((model(seen.ends[on_box]) > 0.5).double().mean())
+        row |= {"scans until 50% left": "> 30", "scans until 10% left": "> 30"}
         for after in range(1, 31):
             scan = street_scan(0.1 * (after % 20), 20_000, 1_000 + after)
             stream_scans(model, [scan], StreamConfig(seed=after))
             left = float((model(seen.ends[on_box]) > 0.5).double().mean())
             for share in (0.5, 0.1):
-                if left <= share:
-                    row.setdefault(f"scans until {share:.0%} left", after)
+                name = f"scans until {share:.0%} left"
+                if left <= share and row[name] == "> 30":
+                    row[name] = after
         row["left after 30"] = left
         rows.append(row)
     return rows

@@ -8,7 +8,7 @@ explain them, and only the others are clustered.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -39,6 +39,8 @@ from lardhm_torch.replay import (
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
 KERNEL_STDS = 2.0  # how far a cluster is taken to reach when those near a scan are chosen
+# The map recalls its own leaning to hits, so that new points need no more of it.
+UPDATE_FIT = FitConfig(passes=2, l2=0.01, occupied_share=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,11 +52,11 @@ class UpdateConfig:
     radius: float = 3.0  # a point this near to the nearest center of its class joins the cluster
     reach: float = 4.0  # nearer points make no new cluster
     fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
-    refine: float = 1.0  # a scan with so many times the points of a cluster makes finer ones of it
+    refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
     max_points: int = 100_000  # that train the weights, at random; all points enter the clusters
     replay: int = 16  # points recalled from an old cluster; 0: train on new points only
     memory: float = 400.0  # a cluster's past counts at most as many points: the world may change
-    fit: FitConfig = field(default_factory=lambda: FitConfig(passes=2, l2=0.01))
+    fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
         if not 0 < self.radius <= self.reach:

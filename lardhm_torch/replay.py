@@ -18,10 +18,10 @@ from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, fit_weights, training_order
 from lardhm_torch.map_state import MapState
 
-MIN_PASSES = 3  # free points that it takes: single ones come from noise in range and pose
-INSIDE = (
-    0.011  # kernel value at three standard deviations: a free point nearer contradicts a cluster
-)
+# Free points within four standard deviations of an occupied cluster (a kernel value of 0.0003)
+# contradict it, if they are so many: single ones come from noise in range and pose.
+INSIDE = 0.000335
+MIN_PASSES = 2
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def remembered_strength(known: MapState, new: Evidence, memory: float, floor: fl
     counts = new.strength[inside]
     hits = torch.zeros_like(own.weights).index_add_(0, owner[kinds], counts[kinds])
     passes = torch.zeros_like(own.weights).index_add_(0, owner[~kinds], counts[~kinds])
-    worth = passes * share / (1 - share)  # in units of hits: both classes have the same total
+    worth = passes * share / (1 - share)  # in units of hits, as if both classes had one total
     held = strength[occupied]
     denied = (worth > hits) & (passes >= MIN_PASSES)
     return strength.index_copy(0, occupied, torch.where(denied, held.minimum(worth), held))
@@ -165,7 +165,7 @@ def learn(
     config: FitConfig,
     rng: torch.Generator,
 ) -> Tensor:
-    """(M,) weights trained on the evidence, both classes with the same total, from the given start.
+    """(M,) weights trained on the evidence from a start; the classes share the loss as in `fit`.
 
     The regularizer is spread over all that the evidence stands for, not over the few points that
     carry it: otherwise every scan would pull the weights further to zero.
@@ -178,7 +178,10 @@ def learn(
     total, occupied = strength.sum(), (strength * is_occupied).sum()
     counts = strength * (len(evidence) / total)
     if config.balance and bool((occupied > 0) & (occupied < total)):
-        counts *= 0.5 * torch.where(is_occupied, total / occupied, total / (total - occupied))
+        own = config.occupied_share
+        counts *= torch.where(
+            is_occupied, own * total / occupied, (1 - own) * total / (total - occupied)
+        )
     scaled = replace(config, l2=config.l2 * len(evidence) / float(total))
 
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,6 @@ import torch
 from tqdm import tqdm
 
 from lardhm_torch import checkpoint
-from lardhm_torch.fitting import FitConfig
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.incremental import UpdateConfig
 from lardhm_torch.sampling import SamplingConfig, sample_rays, usable_rays
@@ -48,11 +47,9 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
     config = config or StreamConfig()
     return replace(
         config,
-        max_rays=50_000,
+        max_rays=40_000,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(
-            config.update, max_points=40_000, replay=6, fit=FitConfig(passes=2, l2=0.01)
-        ),
+        update=replace(config.update, max_points=40_000, replay=6),
     )
 
 
