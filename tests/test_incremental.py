@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_clustering import cluster_moments
 
 from lardhm_torch import (
     LardHilbertMap,
@@ -13,7 +14,7 @@ from lardhm_torch import (
     sample_rays,
     split_rays,
 )
-from lardhm_torch.clustering import cluster_moments, cluster_points, factor_covariances
+from lardhm_torch.clustering import cluster_points, factor_covariances
 from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState
 from lardhm_torch.merging import match_clusters, merge_clusters
