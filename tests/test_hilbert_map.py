@@ -149,7 +149,7 @@ def test_a_map_changes_size_while_an_answer_with_a_graph_is_around():
     after.sum().backward()
     assert model.weights.grad.shape == (len(model),)
     # The native kernel's graph says the first, that of plain torch the second.
-    with pytest.raises(RuntimeError, match="modified by an inplace operation|must match the size"):
+    with pytest.raises(RuntimeError, match=r"modified by an inplace operation|must match the size"):
         before.sum().backward()
 
 
