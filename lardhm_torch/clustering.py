@@ -58,9 +58,8 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     centers = mini_batch_kmeans(points, num_clusters, rng)
     _, counts, sums, scatters = native.assign(points, centers)
     clusters = merge_small(clusters_about(centers, counts, sums, scatters))
-    order = z_order(
-        clusters.means
-    )  # neighbors in space are neighbors in memory: queries are faster
+    # Neighbors in space are neighbors in memory: queries of large maps are faster.
+    order = z_order(clusters.means)
     return Clusters(clusters.counts[order], clusters.means[order], clusters.scatters[order])
 
 

@@ -402,11 +402,9 @@ class LardHilbertMap(nn.Module):
     ) -> None:
         order = training_order(local, config.rows_a_batch(len(local)), rng)
         local, labels = local[order], labels[order]
-        state = (self.centers.detach(), self.raw_scale_tril.detach(), self.kernel)
-        index = self._fresh_index()
 
         def features_of(rows: slice) -> tuple[Tensor, Tensor]:
-            return native.nearest_features(local[rows], *state, index)
+            return self._nearest_features(local[rows])
 
         weights = fit_weights(features_of, labels, self.weights.detach(), config, progress)
         with torch.no_grad():

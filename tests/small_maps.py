@@ -5,6 +5,10 @@ import math
 import torch
 from torch import nn
 
+from lardhm_torch import LardHilbertMap
+
+F64 = torch.float64
+
 
 class GaussianMap(nn.Module):
     """A map in a few lines: every cluster answers for every point."""
@@ -41,3 +45,29 @@ def random_map(seed, dim=3, clusters=6):
     factors += torch.diag_embed(0.2 + torch.rand(clusters, dim, generator=rng))
     weights = 4 * torch.randn(clusters, generator=rng)
     return GaussianMap(2 * torch.randn(clusters, dim, generator=rng), factors, weights)
+
+
+def wall(count=600, dim=3, seed=0, at=1.0):
+    """Points of a wall at x = ``at`` and of the free space before it."""
+    rng = torch.Generator().manual_seed(seed)
+    points = torch.rand(2 * count, dim, generator=rng, dtype=F64) * 2
+    points[:count, 0] = 1 + 0.02 * torch.randn(count, generator=rng, dtype=F64)
+    points[count:, 0] *= 0.4
+    points[:, 0] += at - 1
+    labels = torch.zeros(2 * count)
+    labels[:count] = 1
+    return points, labels
+
+
+def wall_map(dim=3, dtype=F64, **settings):
+    return LardHilbertMap(dim, **settings).to(dtype).fit(*wall(dim=dim), num_clusters=40)
+
+
+def same_map(first, second):
+    ours, theirs = first.state_dict(), second.state_dict()
+    return all(
+        torch.equal(ours[k], theirs[k])
+        if isinstance(ours[k], torch.Tensor)
+        else ours[k] == theirs[k]
+        for k in ours | theirs
+    )

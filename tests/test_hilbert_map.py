@@ -5,37 +5,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_maps import same_map, wall, wall_map
 from torch import nn
 
 import lardhm_torch
 from lardhm_torch import FitConfig, LardHilbertMap, load_scans, sample_rays, split_rays
 
 F64 = torch.float64
-
-
-def wall(count=600, dim=3, seed=0):
-    """Points of a wall at x = 1 and of the free space before it."""
-    rng = torch.Generator().manual_seed(seed)
-    points = torch.rand(2 * count, dim, generator=rng, dtype=F64) * 2
-    points[:count, 0] = 1 + 0.02 * torch.randn(count, generator=rng, dtype=F64)
-    points[count:, 0] *= 0.4
-    labels = torch.zeros(2 * count)
-    labels[:count] = 1
-    return points, labels
-
-
-def wall_map(dim=3, dtype=F64, **settings):
-    return LardHilbertMap(dim, **settings).to(dtype).fit(*wall(dim=dim), num_clusters=40)
-
-
-def same_map(first, second):
-    ours, theirs = first.state_dict(), second.state_dict()
-    return all(
-        torch.equal(ours[k], theirs[k])
-        if isinstance(ours[k], torch.Tensor)
-        else ours[k] == theirs[k]
-        for k in ours | theirs
-    )
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 5])

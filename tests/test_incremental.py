@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from small_maps import same_map, wall, wall_map
 from test_clustering import cluster_moments
 
 from lardhm_torch import (
@@ -21,32 +22,6 @@ from lardhm_torch.merging import match_clusters, merge_clusters
 
 F64 = torch.float64
 PAPER = UpdateConfig(as_in_paper=True, replay=0)
-
-
-def wall(count=600, dim=3, seed=0, at=1.0):
-    """Points of a wall at x = ``at`` and of the free space before it."""
-    rng = torch.Generator().manual_seed(seed)
-    points = torch.rand(2 * count, dim, generator=rng, dtype=F64) * 2
-    points[:count, 0] = 1 + 0.02 * torch.randn(count, generator=rng, dtype=F64)
-    points[count:, 0] *= 0.4
-    points[:, 0] += at - 1
-    labels = torch.zeros(2 * count)
-    labels[:count] = 1
-    return points, labels
-
-
-def wall_map(dim=3, dtype=F64, **settings):
-    return LardHilbertMap(dim, **settings).to(dtype).fit(*wall(dim=dim), num_clusters=40)
-
-
-def same_map(first, second):
-    ours, theirs = first.state_dict(), second.state_dict()
-    return all(
-        torch.equal(ours[k], theirs[k])
-        if isinstance(ours[k], torch.Tensor)
-        else ours[k] == theirs[k]
-        for k in ours | theirs
-    )
 
 
 def state_of(clusters, is_occupied):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_incremental import F64, same_map, wall, wall_map
+from small_maps import F64, same_map, wall, wall_map
 
 from lardhm_torch import LardHilbertMap, load_scans, merge_maps, sample_rays, split_rays
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_incremental import same_map, wall
+from small_maps import same_map, wall
 
 from lardhm_torch import (
     LardHilbertMap,
