@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -38,7 +39,7 @@ from lardhm_torch.tiles.store import (
 )
 
 MEMORY_LIMIT = 1 << 30  # bytes of clusters held at a time
-WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts", "origin")
+WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts")
 POINTS_AT_ONCE = 1 << 22  # points sorted by block at a time
 
 
@@ -73,7 +74,9 @@ class TiledMap:
         self.memory_limit = int(memory_limit)
         self.dim = manifest.dim
         self.num_neighbors = int(manifest.settings["num_neighbors"])
+        self.covariance_scale = float(manifest.settings["covariance_scale"])
         self.settings = dict(manifest.settings)
+        self.origin = torch.tensor(manifest.origin, dtype=torch.float64, device=device)
         self._store = TileStore(folder, manifest, skip_damaged=skip_damaged, device=device)
         self._layout = layout_of(manifest)
         self._blocks = speaking_blocks(self._layout)
@@ -203,6 +206,10 @@ class TiledMap:
                 result[place] = model.query_lattice(part, probability=probability)
         return result
 
+    def pieces(self) -> Iterator[LardHilbertMap]:
+        """The tiles' own maps, one after the other."""
+        return (self._tile(row) for row in range(len(self._layout.indices)))
+
     def merge(self, bounds: tuple[Any, Any] | None = None) -> LardHilbertMap:
         """An ordinary map that answers within ``bounds`` as this one does, in memory as a whole.
 
@@ -214,20 +221,16 @@ class TiledMap:
             ValueError: bounds are not two corners, lower <= upper.
         """
         if bounds is None:
-            rows = torch.arange(len(self._layout.indices))
-        else:
-            lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
-            if (
-                lower.shape != (self.dim,)
-                or lower.shape != upper.shape
-                or not (lower <= upper).all()
-            ):
-                raise ValueError(
-                    f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
-                    f"got {lower.tolist()} and {upper.tolist()}"
-                )
-            rows = needed_tiles(self._layout, lower, upper)
-        return self._joined(rows, [self._tile(row) for row in rows.tolist()])
+            return self._joined(list(self.pieces()), self.origin)
+        lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
+        good = lower.shape == upper.shape == (self.dim,)
+        if not good or not bool((lower <= upper).all()):
+            raise ValueError(
+                f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
+                f"got {lower.tolist()} and {upper.tolist()}"
+            )
+        rows = needed_tiles(self._layout, lower, upper).tolist()
+        return self._joined([self._tile(row) for row in rows])
 
     @torch.no_grad()
     def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
@@ -242,8 +245,7 @@ class TiledMap:
         _, owner, counts = index.unique(dim=0, return_inverse=True, return_counts=True)
         for rows in owner.argsort(stable=True).split(counts.tolist()):
             box = lower[rows].amin(dim=0), upper[rows].amax(dim=0)
-            self._check_fits(needed_tiles(self._layout, *box), "a part of the map")
-            yield rows, self.merge(box)
+            yield rows.to(self.origin.device), self._part(*box)
 
     # --- how ---
 
@@ -323,7 +325,7 @@ class TiledMap:
                     tiles.append(self._tile(row))
                 except DamagedTileError as error:
                     missing[row] = error
-            model = self._joined(rows, tiles)
+            model = self._joined(tiles)
             self._cache.put(number, model)
             self._missing[number] = missing
         if self._missing[number]:
@@ -331,6 +333,17 @@ class TiledMap:
                 if row in self._missing[number]:
                     raise self._missing[number][row]
         return model
+
+    def _part(self, lower: Tensor, upper: Tensor) -> LardHilbertMap:
+        """The map of a block, if the box (D,) to (D,) lies in one, or a map made for the box."""
+        first, last = self._number(torch.stack([lower, upper])).tolist()
+        index = tile_indices(
+            torch.stack([lower, upper]), self._layout.origin, self._layout.block_edge
+        )
+        if first >= 0 and first == last and bool((index[0] == index[1]).all()):
+            return self._block(first, lower, upper)
+        self._check_fits(needed_tiles(self._layout, lower, upper), "a part of the map")
+        return self.merge((lower, upper))
 
     def _tile(self, row: int) -> LardHilbertMap:
         index = self._layout.indices[row]
@@ -340,16 +353,14 @@ class TiledMap:
             self._cache.put(index, model)
         return model
 
-    def _joined(self, rows: Tensor, tiles: list[LardHilbertMap]) -> LardHilbertMap:
-        if len(rows) == 0:
-            middle = self._layout.origin
-        else:
-            lower, upper = (
-                self._layout.lower[rows].amin(dim=0),
-                self._layout.upper[rows].amax(dim=0),
-            )
-            middle = (lower + upper) / 2
-        model = joined(tiles, self.settings, middle)
+    def _joined(self, tiles: list[LardHilbertMap], origin: Tensor | None = None) -> LardHilbertMap:
+        """One map of tiles; in their own frame if they share one, else in one amid their origins."""
+        if origin is None and tiles:
+            origins = torch.stack([tile.origin for tile in tiles])
+            same = bool((origins == origins[0]).all())
+            middle = (origins.amin(dim=0) + origins.amax(dim=0)) / 2
+            origin = origins[0] if same else middle.round()
+        model = joined(tiles, self.settings, self.origin if origin is None else origin)
         return model.to(self._store.device, self._store.dtype)
 
     def _check_fits(self, rows: Tensor, what: str) -> None:
@@ -376,7 +387,7 @@ class TiledMap:
             index = ((axis.double() - start) / self._layout.block_edge).floor()
             lengths = index.unique_consecutive(return_counts=True)[1].tolist()
             ends = torch.tensor([0, *lengths]).cumsum(0).tolist()
-            runs.append([slice(a, b) for a, b in zip(ends, ends[1:], strict=False)])
+            runs.append([slice(a, b) for a, b in itertools.pairwise(ends)])
         for number in range(math.prod(len(r) for r in runs)):
             place = []
             for options in reversed(runs):
