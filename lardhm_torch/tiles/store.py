@@ -147,14 +147,3 @@ def _in_frame(model: LardHilbertMap, origin: Tensor) -> dict[str, Tensor]:
         for name in ("centers", "means"):
             tensors[name] = (tensors[name].double() + (own - origin)).to(tensors[name].dtype)
     return tensors
-
-
-def rows_of(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
-    """A map of some clusters of another, in its frame."""
-    result = LardHilbertMap(**model.settings).to(model.centers)
-    tensors = {
-        name: tensor if not isinstance(tensor, Tensor) or name == "origin" else tensor[rows]
-        for name, tensor in model.state_dict().items()
-    }
-    result.load_state_dict(tensors)
-    return result
