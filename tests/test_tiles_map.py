@@ -44,14 +44,14 @@ def test_answers_at_borders_are_those_of_the_merged_map(
     tiles = tiled(random_map(1, dim, dtype), tmp_path, monkeypatch, block_clusters)
     assert len(tiles.manifest.tiles) > 10
     assert tiles._layout.block_tiles < 4
-    assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 20_000))
+    assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 10_000))
 
 
 @pytest.mark.parametrize("name", ["kitti00_mulls", "balm_realworld"])
 def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
     name, data, tmp_path, monkeypatch
 ):
-    scans, _ = split_rays(load_scans(data / name), 0.08, seed=0)
+    scans, _ = split_rays(load_scans(data / name), 0.05, seed=0)
     samples = sample_rays(scans, seed=0)
     model = LardHilbertMap().fit(samples.points, samples.labels)
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 500)
@@ -242,7 +242,7 @@ def test_variances_are_those_of_the_merged_map(tmp_path, monkeypatch):
 def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
     model = random_map(clusters=3000)
     tiled(model, tmp_path, monkeypatch)
-    limit = 4000 * cluster_bytes(3, F64)
+    limit = 5000 * cluster_bytes(3, F64)
     tiles = TiledMap.open(tmp_path / "tiles", memory_limit=limit)
     points = border_points(tiled(model, tmp_path / "again", monkeypatch), 1500)
     expected = model(points)
@@ -250,7 +250,7 @@ def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
         tiles(some)
         held = sum(m.centers.numel() for m, _ in tiles._cache._entries.values()) // 3
         assert held * cluster_bytes(3, F64) == tiles._cache.num_bytes
-        assert held <= 4000
+        assert held <= 5000
     torch.testing.assert_close(tiles(points), expected)
 
 
