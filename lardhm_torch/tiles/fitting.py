@@ -106,7 +106,7 @@ class _Job:
         self.config = FitConfig(**self.manifest.fitting)
         self.budget = make_budget(self.ledger.tiles, self.config)
         self.empty = LardHilbertMap(**self.manifest.settings).to(
-            self.device, getattr(torch, self.manifest.dtype)
+            self.device, getattr(torch, getattr(self.manifest, "dtype", "float32"))
         )
         for name in ("clusters", "fitted", "tiles"):
             (folder / name).mkdir(exist_ok=True)
@@ -130,7 +130,7 @@ class _Job:
         return self._largest_first(
             index
             for index in needed
-            if clustered_points(self._clusters_path(index)) != self.ledger.tiles[index].core
+            if clustered_points(self._clusters_path(index), self.empty.centers) != self.ledger.tiles[index].core
         )
 
     def unfitted(self, wanted: list[Index]) -> list[Index]:
@@ -170,7 +170,7 @@ class _Job:
         path = self._fitted_path(index, ".pt")
         model.cpu().save(path)
         record = tile_record(model, path, self.ledger.tiles[index].core)
-        with replaced_file(self._fitted_path(index, ".json")) as partial:
+        with replaced_file(self._fitted_path(index, ".json"), durable=False) as partial:
             partial.write_text(json.dumps({"chunks": self.ledger.chunks, **vars(record)}))
 
     def _points(self, index: Index) -> TilePoints:
@@ -217,7 +217,7 @@ class _Job:
     # --- files ---
 
     def _clusters(self, index: Index) -> TileClusters:
-        return load_clusters(self._clusters_path(index), self.manifest.dim, self.empty.centers)
+        return load_clusters(self._clusters_path(index), self.empty.centers)
 
     def _clusters_path(self, index: Index) -> Path:
         return self.folder / "clusters" / f"{tile_name(index)}.npy"
