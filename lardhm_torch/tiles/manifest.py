@@ -24,6 +24,7 @@ from lardhm_torch.tiles.reach import cluster_reach
 
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
+DTYPES = ("float32", "float64")
 SETTINGS = ("dim", "num_neighbors", "covariance_scale", "min_lengthscale")
 _LARGEST_INDEX = 1 << 40  # of a tile along an axis; beyond it a float64 knows no centimeters
 
@@ -74,6 +75,7 @@ class Manifest:
         halo: how far around a tile its neighbors took part in its training [m].
         origin: (D,) world position of the corner where tile (0, 0, 0) begins [m].
         settings: the arguments that make an empty map like those of the tiles.
+        dtype: of the tiles' tensors, "float32" or "float64".
         sampling: how the routed points were sampled, plain values.
         fitting: how tiles are fitted, plain values.
         seed: of sampling, clustering and training.
@@ -84,6 +86,7 @@ class Manifest:
     halo: float = 0.0
     origin: tuple[float, ...]
     settings: Mapping[str, Any]
+    dtype: str = "float32"
     sampling: Mapping[str, Any] = field(default_factory=dict)
     fitting: Mapping[str, Any] = field(default_factory=dict)
     seed: int = 0
@@ -96,6 +99,8 @@ class Manifest:
             raise ValueError(f"edge must be > 0 m; got {self.edge}")
         _check_number("halo", self.halo, 0.0)
         _check_whole("seed", self.seed, None)
+        if self.dtype not in DTYPES:
+            raise ValueError(f"dtype must be one of {DTYPES}; got {self.dtype!r}")
         for name in ("settings", "sampling", "fitting", "tiles"):
             if not isinstance(getattr(self, name), Mapping):
                 raise ValueError(f"{name} must be a table; got {getattr(self, name)!r}")
@@ -170,8 +175,7 @@ def tile_record(model: Any, path: str | os.PathLike[str], num_points: int) -> Ti
 
 def file_checksum(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file, hexadecimal."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def write_manifest(folder: str | os.PathLike[str], manifest: Manifest) -> None:

@@ -12,7 +12,8 @@ def cluster_reach(weights: Tensor, scale_tril: Tensor) -> Tensor:
     """(M,) distance from the center beyond which |weight| * kernel stays below `NEGLIGIBLE` [m].
 
     A kernel falls slowest along its longest axis, where it is exp(-(d / s)^2 / 2) with s the largest
-    singular value of its factor: so d = s sqrt(2 log(|w| / NEGLIGIBLE)), and 0 for a smaller weight.
+    singular value of its factor: so d = s sqrt(2 log(|w| / NEGLIGIBLE)). Weights count as 1 at least:
+    then the kernel values themselves are negligible, too, and variances are as exact as log-odds.
 
     Args:
         weights: (M,).
@@ -21,6 +22,6 @@ def cluster_reach(weights: Tensor, scale_tril: Tensor) -> Tensor:
     Returns:
         (M,) float64.
     """
-    size = weights.detach().double().abs() / NEGLIGIBLE
+    size = weights.detach().double().abs().clamp(min=1)
     longest = torch.linalg.matrix_norm(scale_tril.detach().double(), ord=2)
-    return longest * (2 * size.clamp(min=1).log()).sqrt()
+    return longest * (2 * (size / NEGLIGIBLE).log()).sqrt()

@@ -1,0 +1,399 @@
+"""A map larger than memory: a folder of tiles that answers as one map would."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import uncertainty
+from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.tiles.layout import (
+    block_box,
+    layout_of,
+    needed_tiles,
+    speaking_blocks,
+)
+from lardhm_torch.tiles.manifest import (
+    MANIFEST_NAME,
+    Manifest,
+    read_manifest,
+    tile_indices,
+    tile_path,
+    tile_record,
+    write_manifest,
+)
+from lardhm_torch.tiles.store import (
+    Cache,
+    DamagedTileError,
+    TileStore,
+    cluster_bytes,
+    joined,
+    rows_of,
+)
+
+MEMORY_LIMIT = 1 << 30  # bytes of clusters held at a time
+WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts", "origin")
+POINTS_AT_ONCE = 1 << 22  # points sorted by block at a time
+
+
+class TiledMap:
+    """Answers like a `LardHilbertMap` of all tiles together, and reads only those it needs.
+
+    Points are grouped by blocks of a few tiles. A block is answered by one map of its own tiles and
+    of all others near enough to have a say (`layout` says which, and why the answers are those of
+    the whole map). Blocks and tiles stay in memory until the limit is reached; those unused longest
+    go first. Where no tile speaks nothing is read: probability 1/2.
+
+    A damaged tile raises `DamagedTileError` where its clusters might have a say; elsewhere the map
+    answers as before. Opened with ``skip_damaged`` it warns and goes on as if the tile were empty.
+
+    `merge` makes an ordinary map, of all or of a part; `weights`, `centers` and the other tensors
+    of a map are those of the whole, if it fits the memory limit.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        manifest: Manifest,
+        *,
+        memory_limit: int = MEMORY_LIMIT,
+        skip_damaged: bool = False,
+        device: Any = None,
+    ) -> None:
+        if not memory_limit > 0:
+            raise ValueError(f"memory_limit must be > 0 bytes; got {memory_limit}")
+        self.folder = Path(folder)
+        self.manifest = manifest
+        self.memory_limit = int(memory_limit)
+        self.dim = manifest.dim
+        self.num_neighbors = int(manifest.settings["num_neighbors"])
+        self.settings = dict(manifest.settings)
+        self._store = TileStore(folder, manifest, skip_damaged=skip_damaged, device=device)
+        self._layout = layout_of(manifest)
+        self._blocks = speaking_blocks(self._layout)
+        self._block_indices = self._blocks.indices()
+        self._cache = Cache(self.memory_limit)
+        self._missing: dict[int, dict[int, DamagedTileError]] = {}  # tiles by block
+
+    @classmethod
+    def open(
+        cls,
+        folder: str | os.PathLike[str],
+        *,
+        memory_limit: int = MEMORY_LIMIT,
+        skip_damaged: bool = False,
+        device: Any = None,
+    ) -> TiledMap:
+        """Read the manifest; tiles are read when they are needed.
+
+        Args:
+            folder: of a tiled map.
+            memory_limit: bytes of clusters that are held at a time.
+            skip_damaged: warn of damaged tiles and go on without them.
+            device: of the answers; left out: the CPU.
+
+        Raises:
+            FileNotFoundError: the folder holds no manifest.
+            ValueError: the manifest is damaged; the error names the field.
+        """
+        manifest = read_manifest(folder)
+        options = {"memory_limit": memory_limit, "skip_damaged": skip_damaged, "device": device}
+        return cls(folder, manifest, **options)
+
+    @staticmethod
+    def split(model: LardHilbertMap, folder: str | os.PathLike[str], edge: float) -> TiledMap:
+        """Write an ordinary map as a folder of tiles, and open it.
+
+        Clusters go to the tile that their center is in; nothing is rounded, so that `merge` gives
+        the map back, in the order of the tiles.
+
+        Args:
+            model: a fitted map.
+            folder: a new or empty one.
+            edge: of a tile [m].
+
+        Raises:
+            ValueError: the map is empty, or edge is not > 0.
+            FileExistsError: the folder holds a tiled map already.
+        """
+        folder = Path(folder)
+        if len(model) == 0:
+            raise ValueError("the map must hold clusters to be split; it is empty: fit it first")
+        if (folder / MANIFEST_NAME).exists():
+            raise FileExistsError(f"{folder} must be a new folder; it holds a tiled map already")
+        manifest = Manifest(
+            edge=float(edge),
+            origin=tuple(model.origin.tolist()),
+            settings=model.settings,
+            dtype=str(model.centers.dtype).removeprefix("torch."),
+        )
+        tile_path(folder, (0,)).parent.mkdir(parents=True, exist_ok=True)
+        owners = tile_indices(model.centers.detach(), [0.0] * model.dim, edge)
+        tiles = {}
+        for place in owners.unique(dim=0):
+            rows = (owners == place).all(dim=1).nonzero().squeeze(1)
+            tile, path = rows_of(model, rows), tile_path(folder, tuple(place.tolist()))
+            tile.save(path)
+            tiles[tuple(place.tolist())] = tile_record(tile, path, int(tile.counts.sum()))
+        write_manifest(folder, Manifest(**{**vars(manifest), "tiles": tiles}))
+        return TiledMap.open(folder)
+
+    # --- what the map is ---
+
+    def __len__(self) -> int:
+        """Number of clusters of all tiles."""
+        return int(self._layout.counts.sum())
+
+    def __repr__(self) -> str:
+        """What `print(model)` shows."""
+        settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())
+        tiles = len(self._layout.indices)
+        return (
+            f"TiledMap({str(self.folder)!r}, {tiles} tiles, num_clusters={len(self)}, {settings})"
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        """Tensors of the whole map: those of `merge()`, if that fits the memory limit."""
+        if name not in WHOLE:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(self._whole(), name)
+
+    # --- what the map answers ---
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) probability of occupancy."""
+        return self._ask(points, lambda model, part: model(part), 0.5)
+
+    def log_odds(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) log-odds of occupancy."""
+        return self._ask(points, lambda model, part: model.log_odds(part), 0.0)
+
+    def variance(self, points: Tensor) -> Tensor:
+        """As `LardHilbertMap.variance`; the tiles' posteriors must be there."""
+        return self._ask(
+            points, lambda model, part: model.variance(part), uncertainty.PRIOR_VARIANCE
+        )
+
+    def bayesian_probability(self, points: Tensor) -> Tensor:
+        """As `LardHilbertMap.bayesian_probability`; the tiles' posteriors must be there."""
+        return self._ask(points, lambda model, part: model.bayesian_probability(part), 0.5)
+
+    @torch.no_grad()
+    def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
+        """As `LardHilbertMap.query_lattice`, block by block."""
+        if len(axes) != self.dim:
+            raise ValueError(f"axes must be {self.dim} lists of coordinates; got {len(axes)}")
+        if not all(bool(axis.isfinite().all()) for axis in axes):
+            raise ValueError("axes must be finite; got NaN or infinity")
+        shape, silent = [len(axis) for axis in axes], 0.5 if probability else 0.0
+        result = torch.full(shape, silent, dtype=self._store.dtype, device=self._store.device)
+        for place in self._lattice_parts(axes):
+            part = [axis[rows] for axis, rows in zip(axes, place, strict=True)]
+            corner = torch.stack([axis[0].double().cpu() for axis in part])
+            number = int(self._number(corner[None])[0])
+            if number >= 0:
+                ends = torch.stack([torch.stack([a.min(), a.max()]) for a in part]).double().cpu()
+                model = self._block(number, ends[:, 0], ends[:, 1])
+                result[place] = model.query_lattice(part, probability=probability)
+        return result
+
+    def merge(self, bounds: tuple[Any, Any] | None = None) -> LardHilbertMap:
+        """An ordinary map that answers within ``bounds`` as this one does, in memory as a whole.
+
+        Args:
+            bounds: lower and upper corner (D,), world frame [m]; left out: everywhere.
+
+        Raises:
+            DamagedTileError: a tile that it needs is damaged.
+            ValueError: bounds are not two corners, lower <= upper.
+        """
+        if bounds is None:
+            rows = torch.arange(len(self._layout.indices))
+        else:
+            lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
+            if (
+                lower.shape != (self.dim,)
+                or lower.shape != upper.shape
+                or not (lower <= upper).all()
+            ):
+                raise ValueError(
+                    f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
+                    f"got {lower.tolist()} and {upper.tolist()}"
+                )
+            rows = needed_tiles(self._layout, lower, upper)
+        return self._joined(rows, [self._tile(row) for row in rows.tolist()])
+
+    @torch.no_grad()
+    def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
+        """For N boxes, (N, D) world [m]: rows of those near each other, and a map for inside them.
+
+        Raises:
+            ValueError: a part does not fit the memory limit.
+        """
+        lower, upper = lower.detach().double().cpu(), upper.detach().double().cpu()
+        middle = (lower + upper) / 2
+        index = ((middle - self._layout.origin) / self._layout.block_edge).floor()
+        _, owner, counts = index.unique(dim=0, return_inverse=True, return_counts=True)
+        for rows in owner.argsort(stable=True).split(counts.tolist()):
+            box = lower[rows].amin(dim=0), upper[rows].amax(dim=0)
+            self._check_fits(needed_tiles(self._layout, *box), "a part of the map")
+            yield rows, self.merge(box)
+
+    # --- how ---
+
+    def _ask(
+        self, points: Tensor, answer: Callable[[LardHilbertMap, Tensor], Tensor], silent: float
+    ) -> Tensor:
+        """Answers of the blocks' maps at (..., D) points; ``silent`` where no tile speaks."""
+        points = torch.as_tensor(points, device=self._store.device)
+        if points.ndim == 0 or points.shape[-1] != self.dim:
+            raise ValueError(
+                f"points must be (..., {self.dim}), one row of coordinates per point; "
+                f"got {tuple(points.shape)}"
+            )
+        flat = points.reshape(-1, self.dim)
+        result = torch.full((len(flat),), silent, dtype=self._store.dtype, device=flat.device)
+        keeps_graph = torch.is_grad_enabled() and flat.requires_grad
+        where, answers = [], []
+        for number, rows in self._rows_by_block(flat.detach(), result):
+            part = flat[rows]
+            corners = part.detach().double()
+            model = self._block(number, corners.amin(0).cpu(), corners.amax(0).cpu())
+            if len(model) == 0:
+                continue
+            if keeps_graph:
+                where.append(_positions(rows, flat.device))
+                answers.append(answer(model, part))
+            else:
+                result[rows] = answer(model, part)
+        if keeps_graph:  # one node of the graph, however many blocks
+            result = result + 0.0 * torch.nan_to_num(flat, 0.0, 0.0, 0.0).sum(dim=1).to(
+                result.dtype
+            )
+            if where:
+                result = result.index_copy(0, torch.cat(where), torch.cat(answers))
+        return result.reshape(points.shape[:-1])
+
+    def _rows_by_block(self, flat: Tensor, result: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
+        """Number of a block and rows of its points, for all points that any tile has a say in.
+
+        Points that are not finite get NaN in the result. Runs of points of one block stay runs.
+        """
+        for start in range(0, len(flat), POINTS_AT_ONCE):
+            part = flat[start : start + POINTS_AT_ONCE]
+            numbers = self._number(part)
+            bad = ~part.isfinite().all(dim=1)
+            result[start : start + len(part)][bad] = torch.nan
+            numbers[bad] = -1
+            values, lengths = numbers.unique_consecutive(return_counts=True)
+            begins = lengths.cumsum(0) - lengths
+            order = values.argsort(stable=True)
+            sizes = values.unique(return_counts=True)[1]
+            for runs in order.split(sizes.tolist()):
+                number = int(values[runs[0]])
+                if number < 0:
+                    continue
+                if len(runs) == 1:
+                    first = start + int(begins[runs[0]])
+                    yield number, slice(first, first + int(lengths[runs[0]]))
+                else:
+                    yield number, start + _spread(begins[runs], lengths[runs])
+
+    def _number(self, points: Tensor) -> Tensor:
+        """(N, D) world positions -> (N,) int32 number of the block of each, -1 where none speaks."""
+        index = tile_indices(points, self._layout.origin, self._layout.block_edge)
+        return self._blocks.find(index)
+
+    def _block(self, number: int, lower: Tensor, upper: Tensor) -> LardHilbertMap:
+        """The map that answers in a block; damage matters only to the box asked for, (D,) to (D,)."""
+        model = self._cache.get(number)
+        if model is None:
+            box = block_box(self._layout, self._block_indices[number])
+            rows = needed_tiles(self._layout, *box)
+            self._check_fits(rows, "a block of the map")
+            tiles, missing = [], {}
+            for row in rows.tolist():
+                try:
+                    tiles.append(self._tile(row))
+                except DamagedTileError as error:
+                    missing[row] = error
+            model = self._joined(rows, tiles)
+            self._cache.put(number, model)
+            self._missing[number] = missing
+        if self._missing[number]:
+            for row in needed_tiles(self._layout, lower, upper).tolist():
+                if row in self._missing[number]:
+                    raise self._missing[number][row]
+        return model
+
+    def _tile(self, row: int) -> LardHilbertMap:
+        index = self._layout.indices[row]
+        model = self._cache.get(index)
+        if model is None:
+            model = self._store.load(index)
+            self._cache.put(index, model)
+        return model
+
+    def _joined(self, rows: Tensor, tiles: list[LardHilbertMap]) -> LardHilbertMap:
+        if len(rows) == 0:
+            middle = self._layout.origin
+        else:
+            lower, upper = (
+                self._layout.lower[rows].amin(dim=0),
+                self._layout.upper[rows].amax(dim=0),
+            )
+            middle = (lower + upper) / 2
+        model = joined(tiles, self.settings, middle)
+        return model.to(self._store.device, self._store.dtype)
+
+    def _check_fits(self, rows: Tensor, what: str) -> None:
+        needed = int(self._layout.counts[rows].sum()) * cluster_bytes(self.dim, self._store.dtype)
+        if needed > self.memory_limit:
+            raise ValueError(
+                f"memory_limit must be {needed} bytes or more to hold {what}; "
+                f"got {self.memory_limit}"
+            )
+
+    def _whole(self) -> LardHilbertMap:
+        model = self._cache.get("whole")
+        if model is None:
+            rows = torch.arange(len(self._layout.indices))
+            self._check_fits(rows, "all clusters, which are asked for")
+            model = self.merge()
+            self._cache.put("whole", model)
+        return model
+
+    def _lattice_parts(self, axes: Sequence[Tensor]) -> Iterator[tuple[slice, ...]]:
+        """Sub-lattices of a lattice that lie in one block each."""
+        runs = []
+        for axis, start in zip(axes, self._layout.origin.tolist(), strict=True):
+            index = ((axis.double() - start) / self._layout.block_edge).floor()
+            lengths = index.unique_consecutive(return_counts=True)[1].tolist()
+            ends = torch.tensor([0, *lengths]).cumsum(0).tolist()
+            runs.append([slice(a, b) for a, b in zip(ends, ends[1:], strict=False)])
+        for number in range(math.prod(len(r) for r in runs)):
+            place = []
+            for options in reversed(runs):
+                number, which = divmod(number, len(options))
+                place.append(options[which])
+            yield tuple(reversed(place))
+
+
+def _positions(rows: slice | Tensor, device: torch.device) -> Tensor:
+    if isinstance(rows, slice):
+        return torch.arange(rows.start, rows.stop, device=device)
+    return rows
+
+
+def _spread(begins: Tensor, lengths: Tensor) -> Tensor:
+    """Begins and lengths (R,) of runs -> all positions in them."""
+    owner = torch.repeat_interleave(lengths)
+    ends = lengths.cumsum(0)
+    within = torch.arange(len(owner), device=owner.device) - (ends - lengths)[owner]
+    return begins[owner] + within
