@@ -7,6 +7,7 @@ up to 26 neighbors, so reading must take microseconds.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,15 @@ from torch import Tensor
 
 from lardhm_torch.clustering import Clusters
 from lardhm_torch.files import replaced_file
+from lardhm_torch.tiles.manifest import Index, tile_name
 from lardhm_torch.tiles.training import TileClusters
 
 _HEAD_BYTES = 16
+
+
+def clusters_path(folder: str | os.PathLike[str], index: Index) -> Path:
+    """The clusters of a tile's core."""
+    return Path(folder) / "clusters" / tile_name(index)
 
 
 def save_clusters(path: Path, found: TileClusters, num_points: int) -> None:

@@ -28,7 +28,12 @@ from lardhm_torch.files import replaced_file
 from lardhm_torch.fitting import FitConfig
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.map_state import MapState, write_state
-from lardhm_torch.tiles.cluster_files import clustered_points, load_clusters, save_clusters
+from lardhm_torch.tiles.cluster_files import (
+    clustered_points,
+    clusters_path,
+    load_clusters,
+    save_clusters,
+)
 from lardhm_torch.tiles.manifest import (
     Index,
     Manifest,
@@ -50,7 +55,9 @@ from lardhm_torch.tiles.training import (
 )
 
 MOST_POINTS = 1 << 23  # of a tile that are held at a time; a tile of more is fitted to so many
-CLUSTER_SHARE = 0.45  # of the time that the clusters of a tile take, for the estimate of what is left
+CLUSTER_SHARE = (
+    0.45  # of the time that the clusters of a tile take, for the estimate of what is left
+)
 
 
 @torch.no_grad()
@@ -74,7 +81,9 @@ def fit_tiles(folder: str | os.PathLike[str], *, progress: bool = False) -> Mani
     with join_ranks() as ranks, one_thread():
         job = _Job(Path(folder), ranks)
         wanted = [tuple(index) for index in ranks.agree("wanted", job.wanted)]
-        unclustered = [tuple(i) for i in ranks.agree("unclustered", lambda: job.unclustered(wanted))]
+        unclustered = [
+            tuple(i) for i in ranks.agree("unclustered", lambda: job.unclustered(wanted))
+        ]
         unfitted = [tuple(index) for index in ranks.agree("left", lambda: job.unfitted(wanted))]
         phases = (
             ("clusters", unclustered, job.cluster, CLUSTER_SHARE),
@@ -106,7 +115,7 @@ class _Job:
         self.config = FitConfig(**self.manifest.fitting)
         self.budget = make_budget(self.ledger.tiles, self.config)
         self.empty = LardHilbertMap(**self.manifest.settings).to(
-            self.device, getattr(torch, getattr(self.manifest, "dtype", "float32"))
+            self.device, getattr(torch, self.manifest.dtype)
         )
         for name in ("clusters", "fitted", "tiles"):
             (folder / name).mkdir(exist_ok=True)
@@ -130,7 +139,8 @@ class _Job:
         return self._largest_first(
             index
             for index in needed
-            if clustered_points(self._clusters_path(index), self.empty.centers) != self.ledger.tiles[index].core
+            if clustered_points(clusters_path(self.folder, index), self.empty.centers)
+            != self.ledger.tiles[index].core
         )
 
     def unfitted(self, wanted: list[Index]) -> list[Index]:
@@ -153,7 +163,7 @@ class _Job:
             self.budget.num_clusters(self.ledger.tiles[index]),
             self._rng(index, "clusters"),
         )
-        save_clusters(self._clusters_path(index), found, self.ledger.tiles[index].core)
+        save_clusters(clusters_path(self.folder, index), found, self.ledger.tiles[index].core)
 
     def train(self, index: Index) -> None:
         """Phase two: a tile's map, and its entry of the manifest, to ``fitted/``."""
@@ -217,10 +227,7 @@ class _Job:
     # --- files ---
 
     def _clusters(self, index: Index) -> TileClusters:
-        return load_clusters(self._clusters_path(index), self.empty.centers)
-
-    def _clusters_path(self, index: Index) -> Path:
-        return self.folder / "clusters" / f"{tile_name(index)}.npy"
+        return load_clusters(clusters_path(self.folder, index), self.empty.centers)
 
     def _fitted_path(self, index: Index, suffix: str) -> Path:
         return self.folder / "fitted" / f"{tile_name(index)}{suffix}"

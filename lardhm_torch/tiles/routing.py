@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,6 +34,7 @@ from lardhm_torch.tiles.samples import (
     Records,
     append_records,
     appending,
+    count_records,
     read_ledger,
     record_type,
     write_ledger,
@@ -48,7 +49,7 @@ class TilingConfig:
     """How the world is cut into tiles, and how scans become training points."""
 
     edge: float = 20.0  # [m] of a tile
-    halo: float = 1.0  # [m] around a tile, from which its training sees its neighbors' points
+    halo: float | None = None  # [m] around a tile, trained with it; None: 1 m, half an edge at most
     seed: int = 0  # of everything random; piece n of the scans is sampled with seed + n
     num_neighbors: int | None = None  # k of the maps; None: the default
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -57,7 +58,7 @@ class TilingConfig:
     def __post_init__(self) -> None:
         if not 0 < self.edge < float("inf"):
             raise ValueError(f"edge must be > 0 m and finite; got {self.edge}")
-        if not 0 <= self.halo <= self.edge / 2:
+        if self.halo is not None and not 0 <= self.halo <= self.edge / 2:
             raise ValueError(f"halo must be 0 to half an edge, {self.edge / 2}; got {self.halo}")
 
 
@@ -128,12 +129,13 @@ def add_scans(
                 f"{folder} must be complete before scans are added; run `lardhm tile` to its end"
             )
         router = _Router(Path(folder), manifest, SamplingConfig(**manifest.sampling), before)
-        router.resume_at(before.chunks)
         for piece in _watched(pieces, progress):
             router.take(piece)
         after = router.finish()
     nothing = Counts()
-    return after, [i for i in after.cores if after.tiles[i].core > before.tiles.get(i, nothing).core]
+    return after, [
+        i for i in after.cores if after.tiles[i].core > before.tiles.get(i, nothing).core
+    ]
 
 
 def _watched(pieces: Iterable[Scans], progress: bool) -> Iterator[Scans]:
@@ -149,7 +151,7 @@ def _begin(path: Path, first: Scans, config: TilingConfig) -> Manifest:
     neighbors = {} if config.num_neighbors is None else {"num_neighbors": config.num_neighbors}
     manifest = Manifest(
         edge=config.edge,
-        halo=config.halo,
+        halo=min(1.0, config.edge / 2) if config.halo is None else config.halo,
         origin=grid_origin(first.origins[0], config.edge),
         settings=LardHilbertMap(first.dim, **neighbors).settings,
         sampling=asdict(config.sampling),
@@ -157,14 +159,16 @@ def _begin(path: Path, first: Scans, config: TilingConfig) -> Manifest:
         seed=config.seed,
     )
     if (path / MANIFEST_NAME).is_file():
-        if read_ledger(path).complete:
+        begun = read_ledger(path)
+        if begun.complete:
             raise ValueError(
                 f"folder must be new; {path} holds a tiled map. `lardhm update` adds scans to it"
             )
-        if read_manifest(path) != manifest:
+        if begun.chunks and read_manifest(path) != manifest:
             raise ValueError(
                 f"folder must be new, or begun with the same scans and settings; {path} was not"
             )
+        write_manifest(path, manifest)
         return manifest
     path.mkdir(parents=True, exist_ok=True)
     others = [entry.name for entry in path.iterdir() if entry.name != LEDGER_NAME]
@@ -181,21 +185,22 @@ def grid_origin(near: Tensor, edge: float) -> tuple[float, ...]:
 
 
 class _Router:
-    """Pieces of scans into the sample files of a folder."""
+    """Pieces of scans into the sample files of a folder.
+
+    The pieces of a new folder are counted from 0, and those that a killed run has routed already are
+    passed over. Those of an addition are counted on, so that no random number is drawn twice, and
+    count only once all are routed.
+    """
 
     def __init__(
-        self, folder: Path, manifest: Manifest, sampling: SamplingConfig, ledger: Ledger
+        self, folder: Path, manifest: Manifest, sampling: SamplingConfig, done: Ledger
     ) -> None:
         self.folder, self.manifest, self.sampling = folder, manifest, sampling
         self.grid = Grid(manifest.origin, manifest.edge, manifest.halo)
-        self.done, self.tiles = ledger, dict(ledger.tiles)
+        self.done, self.adds, self.tiles = done, done.complete, dict(done.tiles)
+        self.chunks, self.rays = (done.chunks, done.rays) if self.adds else (0, 0)
         self.buffers: dict[Index, list[Records]] = {}
-        self.buffered = self.chunks = self.rays = 0
-        self.keeps_place = not ledger.complete  # a whole run can be resumed, an addition not
-
-    def resume_at(self, chunks: int) -> None:
-        """Count pieces from here on: an addition must not draw the random numbers of a run before."""
-        self.chunks = chunks
+        self.buffered = 0
 
     def take(self, piece: Scans) -> None:
         """Sample one piece and keep its points, in memory or on disk."""
@@ -203,46 +208,42 @@ class _Router:
             raise ValueError(
                 f"scans must have {self.manifest.dim} coordinates as the first; got {piece.dim}"
             )
-        number, self.chunks, self.rays = self.chunks, self.chunks + 1, self.rays + len(piece)
-        if self.keeps_place and number < self.done.chunks:
-            if self.chunks == self.done.chunks and self.rays != self.done.rays:
-                raise ValueError(
-                    f"scans must be those that {self.folder} was begun with, {self.done.rays} rays "
-                    f"in the first {self.chunks} pieces; got {self.rays}"
-                )
+        seed = self.manifest.seed + self.chunks
+        self.chunks, self.rays = self.chunks + 1, self.rays + len(piece)
+        if self.chunks <= self.done.chunks:
+            self._check_place(self.chunks == self.done.chunks and self.rays != self.done.rays)
             return
         if not bool(usable_rays(piece, self.sampling)[0].any()):
             return
-        samples = sample_rays(piece, self.sampling, seed=self.manifest.seed + number)
+        samples = sample_rays(piece, self.sampling, seed=seed)
         for index, records in route(samples.points, samples.labels, self.grid):
             self.buffers.setdefault(index, []).append(records)
             self.buffered += records.nbytes
         if self.buffered >= BUFFER_BYTES:
             self._flush()
-            if self.keeps_place:
+            if not self.adds:
                 self._commit(complete=False)
 
     def finish(self) -> Ledger:
         """All records to disk, and from now on they count."""
-        if self.chunks < self.done.chunks:
-            raise ValueError(
-                f"scans must be those that {self.folder} was begun with, {self.done.chunks} pieces "
-                f"at least; got {self.chunks}"
-            )
+        self._check_place(self.chunks < self.done.chunks)
         self._flush()
         if not self.tiles:
             raise ValueError("scans must hold at least one usable ray; got none")
         return self._commit(complete=True)
 
+    def _check_place(self, is_wrong: bool) -> None:
+        if is_wrong:
+            raise ValueError(
+                f"scans must be those that {self.folder} was begun with, {self.done.rays} rays in "
+                f"the first {self.done.chunks} pieces; got {self.rays} in {self.chunks}"
+            )
+
     def _flush(self) -> None:
         for index, parts in self.buffers.items():
             records = np.concatenate(parts)
             append_records(self.folder, index, records)
-            hits, free, _, halo = np.bincount(records["kind"], minlength=4)[[1, 0, 2, 3]]
-            old = self.tiles.get(index, Counts())
-            self.tiles[index] = Counts(
-                old.hits + int(hits), old.free + int(free), old.halo + int(halo + _)
-            )
+            self.tiles[index] = self.tiles.get(index, Counts()).plus(count_records(records))
         self.buffers, self.buffered = {}, 0
 
     def _commit(self, complete: bool) -> Ledger:

@@ -43,6 +43,10 @@ class Counts(NamedTuple):
         """Points of the tile itself."""
         return self.hits + self.free
 
+    def plus(self, other: Counts) -> Counts:
+        """Both together."""
+        return Counts(*(ours + theirs for ours, theirs in zip(self, other, strict=True)))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Ledger:
@@ -150,6 +154,12 @@ def _roll_back(folder: str | os.PathLike[str], dim: int) -> Ledger:
             "The file was cut: tile the scans anew"
         )
     return ledger
+
+
+def count_records(records: Records) -> Counts:
+    """How many there are of each kind."""
+    free, hits, *halo = np.bincount(records["kind"], minlength=4).tolist()
+    return Counts(hits, free, sum(halo))
 
 
 def read_records(
