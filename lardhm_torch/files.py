@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 @contextmanager
-def replaced_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replaced_file(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[Path]:
     """A new file beside path, which takes path's name at the end of the block, in one step.
 
     After a failure or a kill the old file is still there, whole. Who has it open keeps its
@@ -18,6 +18,11 @@ def replaced_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
         with replaced_file("map.pt") as partial:
             torch.save(state, partial)
+
+    Args:
+        path: of the file.
+        durable: False saves the milliseconds that it takes to have the bytes on the disk: after a
+            power failure (not after a kill) the file may then be empty or cut.
 
     Yields:
         A path of the same folder and extension, to an empty file.
@@ -37,8 +42,9 @@ def replaced_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # as the umask allows
     try:
         yield partial
-        with open(partial, "rb+") as file:
-            os.fsync(file.fileno())
+        if durable:
+            with open(partial, "rb+") as file:
+                os.fsync(file.fileno())
         os.replace(partial, target)
     finally:
         partial.unlink(missing_ok=True)

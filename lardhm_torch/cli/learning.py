@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from lardhm_torch.cli.scan_files import iter_scans_of, read_scans, report_dropped
+from lardhm_torch.cli.tiling import update_folder
 
 # torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
 
@@ -108,7 +109,12 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
 
 
 def update(arguments: argparse.Namespace) -> None:
-    """More scans into a map, one after the other."""
+    """More scans into a map, one after the other; a tiled map is updated in place."""
+    if Path(arguments.map).is_dir():
+        update_folder(arguments)
+        return
+    if arguments.output is None:
+        raise ValueError("--output FILE is needed; only a tiled map is updated in place")
     from lardhm_torch import LardHilbertMap, StreamConfig, stream_scans
 
     model = LardHilbertMap.load(arguments.map)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from lardhm_torch.cli import asking, learning
+from lardhm_torch.cli import asking, learning, tiling
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -19,12 +19,15 @@ def make_parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(run: Any, **defaults: Any) -> argparse.ArgumentParser:
-        sub = verbs.add_parser(run.__name__, help=run.__doc__, description=run.__doc__)
+        sub = verbs.add_parser(
+            run.__name__.replace("_", "-"), help=run.__doc__, description=run.__doc__
+        )
         sub.set_defaults(run=run, **defaults)
         return sub
 
     _scan_verbs(verb)
     _map_verbs(verb)
+    _tile_verbs(verb)
     return parser
 
 
@@ -68,7 +71,7 @@ def _map_verbs(verb: Any) -> None:
     sub = verb(learning.update)
     sub.add_argument("map")
     _scans(sub)
-    _output(sub)
+    sub.add_argument("-o", "--output", metavar="FILE", help="needed unless MAP is a tiled folder")
     sub.add_argument("--clusters", type=int, help="of a scan in an unknown place (from the data)")
     _radius(sub)
     _seed(sub)
@@ -119,6 +122,25 @@ def _map_verbs(verb: Any) -> None:
     sub = verb(asking.info)
     sub.add_argument("map")
     sub.add_argument("--json", action="store_true", help="print JSON instead of lines")
+
+
+def _tile_verbs(verb: Any) -> None:
+    sub = verb(tiling.tile)
+    _scans(sub)
+    sub.add_argument("-o", "--output", required=True, metavar="FOLDER")
+    sub.add_argument("--edge", type=float, default=20.0, help="of a tile [m] (20)")
+    sub.add_argument("--halo", type=float, help="around a tile, trained with it [m] (1)")
+    sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
+    sub.add_argument("--dim", type=int, help="2 drops a constant last column")
+    _seed(sub)
+
+    sub = verb(tiling.fit_tiles)
+    sub.add_argument("folder")
+
+    sub = verb(tiling.join)
+    sub.add_argument("maps", nargs=2, metavar=("FIRST", "SECOND"))
+    sub.add_argument("-o", "--output", required=True, metavar="FILE")
+    _seed(sub)
 
 
 def _scans(sub: argparse.ArgumentParser, nargs: str = "+") -> None:

@@ -27,6 +27,14 @@ def iter_scans_of(arguments: argparse.Namespace, dim: int | None = None) -> Iter
         yield _with_dim(scan, arguments, dim)
 
 
+def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Iterator[Scans]:
+    """The same in pieces of bounded size, for scans larger than memory."""
+    from lardhm_torch.io import iter_pieces
+
+    for piece in iter_pieces(arguments.scans, **_reading(arguments)):
+        yield _with_dim(piece, arguments, dim)
+
+
 def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
     """How the files are to be read."""
     from lardhm_torch.io import Camera

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -37,11 +38,11 @@ from lardhm_torch.io.bag_scans import is_bag_folder, read_bag
 from lardhm_torch.io.e57 import read_e57
 from lardhm_torch.io.frames import placed
 from lardhm_torch.io.kitti import read_kitti
-from lardhm_torch.io.las import read_las
-from lardhm_torch.io.numpy_files import read_npy, read_npz, read_npz_points, write_npz
+from lardhm_torch.io.las import las_pieces, read_las
+from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
 from lardhm_torch.io.paths import POSE_FILES, expand_paths
 from lardhm_torch.io.pcd import read_pcd
-from lardhm_torch.io.ply import read_ply
+from lardhm_torch.io.ply import ply_pieces, read_ply
 from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.rgbd import Camera, is_rgbd_folder, read_rgbd
@@ -49,6 +50,7 @@ from lardhm_torch.io.text import read_text
 from lardhm_torch.scans import Scans, concatenate_scans
 
 PathLike = str | os.PathLike[str]
+PIECE_RAYS = 1 << 18  # rays of a piece; their samples take about 100 MB
 
 _READERS: dict[str, Callable[[Path], Readout]] = {
     ".npz": read_npz,
@@ -64,6 +66,12 @@ _READERS: dict[str, Callable[[Path], Readout]] = {
     ".bag": read_bag,
     ".db3": read_bag,
     ".mcap": read_bag,
+}
+_PIECE_READERS: dict[str, Callable[[Path, int], Iterator[Readout]]] = {
+    ".npz": npz_pieces,
+    ".ply": ply_pieces,
+    ".las": las_pieces,
+    ".laz": las_pieces,
 }
 _POINT_READERS = {**_READERS, ".npz": read_npz_points, ".npy": read_npy}
 _FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rgbd_folder}
@@ -110,10 +118,7 @@ def load_scans(
     files = expand_paths(path, _READERS, _kind_of_folder)
     readouts = [_read(file, readers, frame) for file in files]
     if origin is not None and not any(readout.needs_origin for readout in readouts):
-        raise ValueError(
-            "origin must be left out when the files carry their own sensor positions; "
-            f"got origin={tuple(origin)} for {_names(files)}"
-        )
+        raise _origin_error(origin, files)
     dims = {readout.dim: file for file, readout in zip(files, readouts, strict=True)}
     if len(dims) > 1:
         found = ", ".join(f"{dim} in {file}" for dim, file in sorted(dims.items()))
@@ -143,6 +148,36 @@ def iter_scans(
             scan = scans.select(scans.scan_id == number)
             origins, of_all = scans.origins[number : number + 1], torch.zeros_like(scan.scan_id)
             yield Scans(origins, scan.ends, of_all, scan.is_return, scan.target_index)
+
+
+def iter_pieces(
+    path: PathLike | Sequence[PathLike],
+    origin: Sequence[float] | None = None,
+    *,
+    frame: str | None = None,
+    topic: str | Sequence[str] = (),
+    camera: Camera | None = None,
+    max_rays: int = PIECE_RAYS,
+) -> Iterator[Scans]:
+    """All rays of `load_scans` in order, a piece of at most ``max_rays`` at a time.
+
+    LAS, LAZ, binary PLY and ``.npz`` files are read piece by piece and may be larger than memory;
+    of other files one at a time is held.
+
+    Args and errors: as `load_scans`; an error comes when the piece's turn comes.
+    """
+    for file in expand_paths(path, _READERS, _kind_of_folder):
+        reader = None if file.is_dir() else _PIECE_READERS.get(file.suffix.lower())
+        if reader is None:
+            scans = load_scans(file, origin, frame=frame, topic=topic, camera=camera)
+            for start in range(0, len(scans), max_rays):
+                yield scans.select(torch.arange(start, min(len(scans), start + max_rays)))
+            continue
+        pieces = reader(file, max_rays)
+        while (readout := _next_piece(pieces, file, frame)) is not None:
+            if origin is not None and not readout.needs_origin:
+                raise _origin_error(origin, [file])
+            yield _scans_from(readout, file, origin)
 
 
 def save_scans(scans: Scans, path: PathLike) -> None:
@@ -190,10 +225,24 @@ def _read(
 ) -> Readout:
     """One file or folder through its reader; whatever is wrong names it."""
     kind = (_kind_of_folder(file) if file.is_dir() else None) or file.suffix.lower()
+    with _naming(file):
+        readout = readers[kind](file)
+        return readout if frame is None else placed(readout, file, frame)
+
+
+def _next_piece(pieces: Iterator[Readout], file: Path, frame: str | None) -> Readout | None:
+    """The next piece of a file, or None after the last; whatever is wrong names the file."""
+    with _naming(file):
+        readout = next(pieces, None)
+        return readout if readout is None or frame is None else placed(readout, file, frame)
+
+
+@contextmanager
+def _naming(file: Path) -> Iterator[None]:
+    """A block that reads a file: errors name it."""
     try:
         with np.errstate(invalid="ignore", over="ignore"):  # NaN and inf are the sampler's to count
-            readout = readers[kind](file)
-            return readout if frame is None else placed(readout, file, frame)
+            yield
     except ImportError:
         raise
     except OSError as error:
@@ -236,6 +285,13 @@ def _scans_from(readout: Readout, file: Path, origin: Sequence[float] | None) ->
     if not torch.isfinite(scans.origins).all():
         raise ValueError(f"{file}: origins must be finite; got {scans.origins.tolist()[:3]}")
     return scans
+
+
+def _origin_error(origin: Sequence[float], files: list[Path]) -> ValueError:
+    return ValueError(
+        "origin must be left out when the files carry their own sensor positions; "
+        f"got origin={tuple(origin)} for {_names(files)}"
+    )
 
 
 def _names(files: list[Path]) -> str:

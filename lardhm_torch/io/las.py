@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,25 +29,33 @@ def read_las(path: Path) -> Readout:
         ImportError: laspy or its LAZ part is not installed.
         ValueError: the header is not one of LAS, or the file is shorter than it says.
     """
+    pieces = list(las_pieces(path))
+    ends = np.concatenate([piece.ends for piece in pieces])
+    returns = [piece.target_index for piece in pieces if piece.target_index is not None]
+    return replace(pieces[0], ends=ends, target_index=np.concatenate(returns))
+
+
+def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
+    """The same a piece of at most ``max_points`` (default: of 32 MB) at a time; errors as there."""
     with open(path, "rb") as file:
         header = _Header(file, path.stat().st_size)
         if header.is_compressed:
             _check_compressed(file, header)
-    ends, returns = [], []
+    got = 0
     laspy = _import_laspy(path)
+    step = max_points or max(1, _BYTES_AT_A_TIME // header.point_bytes)
     # One thread: the parallel reader takes memory by the chunk table's word.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-        for points in reader.chunk_iterator(max(1, _BYTES_AT_A_TIME // header.point_bytes)):
-            ends.append(np.stack([points.x, points.y, points.z], axis=1).astype(np.float64))
-            returns.append(np.asarray(points.return_number, dtype=np.int64))
-    got = sum(map(len, ends))
+        for points in reader.chunk_iterator(step):
+            ends = np.stack([points.x, points.y, points.z], axis=1).astype(np.float64)
+            got += len(ends)
+            yield Readout(
+                ends,
+                target_index=np.maximum(np.asarray(points.return_number, dtype=np.int64), 1),
+                origin_cure="The format has no place for it: convert to .npz with origins,",
+            )
     if got == 0 or got != header.count:
         raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
-    return Readout(
-        np.concatenate(ends),
-        target_index=np.maximum(np.concatenate(returns), 1),
-        origin_cure="The format has no place for it: convert to .npz with origins,",
-    )
 
 
 def _import_laspy(path: Path) -> Any:

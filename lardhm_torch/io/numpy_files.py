@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -17,6 +19,7 @@ from lardhm_torch.files import replaced_file
 from lardhm_torch.io.readout import Readout, whole_numbers
 
 _DEFLATE_RATIO = 1032  # no deflate stream expands further
+_RAY_ARRAYS = ("points", "scan_id", "is_return", "target_index")  # one entry a ray
 
 
 def read_npz(path: Path) -> Readout:
@@ -28,23 +31,76 @@ def read_npz(path: Path) -> Readout:
         ValueError: the archive is broken, or an array is missing or has the wrong shape or type.
     """
     with zipfile.ZipFile(path) as archive:
-        points = _points_of(archive)
-        origins = _optional(archive, "origins")
-        scan_id = _optional(archive, "scan_id")
-        is_return = _optional(archive, "is_return")
-        target_index = _optional(archive, "target_index")
-    if origins is not None:
-        origins = _coordinates(origins, "origins")
-        if scan_id is None and len(origins) != 1:
-            raise ValueError(f"scan_id is needed to choose among {len(origins)} origins; got none")
+        columns = {"points": _points_of(archive)}
+        for name in _RAY_ARRAYS[1:]:
+            values = _optional(archive, name)
+            if values is not None:
+                columns[name] = values
+        origins = _origins_of(archive, "scan_id" in columns)
+    return _npz_piece(columns, origins)
+
+
+def npz_pieces(path: Path, max_points: int) -> Iterator[Readout]:
+    """The same at most ``max_points`` rays at a time; errors as there."""
+    with zipfile.ZipFile(path) as archive, ExitStack() as stack:
+        present = set(archive.namelist())
+        names = [name for name in _RAY_ARRAYS if f"{name}.npy" in present]
+        columns = {name: stack.enter_context(_Column(archive, name)) for name in names}
+        if "points" not in columns or any(not column.in_rows for column in columns.values()):
+            yield read_npz(path)  # which says what is missing, or turns columns into rows
+            return
+        origins = _origins_of(archive, "scan_id" in columns)
+        lengths = {name: column.length for name, column in columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"arrays must have one entry a point; got {lengths}")
+        for _ in range(0, max(1, lengths["points"]), max_points):
+            yield _npz_piece({name: c.read(max_points) for name, c in columns.items()}, origins)
+
+
+def _npz_piece(columns: dict[str, NDArray], origins: NDArray | None) -> Readout:
+    """Rows of the arrays as rays."""
+    scan_id, is_return = columns.get("scan_id"), columns.get("is_return")
+    target_index = columns.get("target_index")
     return Readout(
-        points,
+        _coordinates(columns["points"], "points"),
         origins,
         None if scan_id is None else _integers(scan_id, "scan_id", 0),
         None if is_return is None else _integers(is_return, "is_return", 0, 1).astype(bool),
         None if target_index is None else _integers(target_index, "target_index", 1),
         origin_cure="Add an array origins (S, D)",
     )
+
+
+class _Column:
+    """One array of an archive, read some rows at a time."""
+
+    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+        entry = _checked_entry(archive, name)
+        self.member = archive.open(entry)
+        try:
+            self.shape, fortran_order, self.dtype = _read_header(self.member)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+        left = entry.file_size - self.member.tell()
+        promised = math.prod(self.shape) * self.dtype.itemsize
+        if min(self.shape, default=0) < 0 or promised != left:
+            raise ValueError(
+                f"{name}: shape {self.shape} of {self.dtype} needs {promised} bytes; got {left}"
+            )
+        self.length = self.shape[0] if self.shape else 0
+        self.in_rows = len(self.shape) > 0 and not (fortran_order and len(self.shape) > 1)
+
+    def read(self, rows: int) -> NDArray:
+        """The next rows, at most so many."""
+        row_bytes = math.prod(self.shape[1:]) * self.dtype.itemsize
+        content = self.member.read(rows * row_bytes)
+        return np.frombuffer(content, self.dtype).reshape(-1, *self.shape[1:])
+
+    def __enter__(self) -> _Column:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.member.close()
 
 
 def read_npz_points(path: Path) -> Readout:
@@ -82,15 +138,30 @@ def _points_of(archive: zipfile.ZipFile) -> NDArray[np.float64]:
     return _coordinates(points, "points")
 
 
-def _optional(archive: zipfile.ZipFile, name: str) -> NDArray | None:
-    """One array of the archive, or None if it is not there."""
-    if f"{name}.npy" not in archive.namelist():
+def _origins_of(archive: zipfile.ZipFile, has_scan_id: bool) -> NDArray[np.float64] | None:
+    """(S, D) sensor positions; None where there are none."""
+    origins = _optional(archive, "origins")
+    if origins is None:
         return None
+    if not has_scan_id and len(origins) != 1:
+        raise ValueError(f"scan_id is needed to choose among {len(origins)} origins; got none")
+    return _coordinates(origins, "origins")
+
+
+def _checked_entry(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
+    """The entry of an array, whose size the file can hold."""
     entry = archive.getinfo(f"{name}.npy")
     held = min(entry.compress_size, os.path.getsize(str(archive.filename)) - entry.header_offset)
     if entry.compress_size > held or entry.file_size > _DEFLATE_RATIO * held + 1024:
         raise ValueError(f"{name} promises {entry.file_size} bytes; {held} cannot hold them")
-    with archive.open(entry) as member:
+    return entry
+
+
+def _optional(archive: zipfile.ZipFile, name: str) -> NDArray | None:
+    """One array of the archive, or None if it is not there."""
+    if f"{name}.npy" not in archive.namelist():
+        return None
+    with archive.open(_checked_entry(archive, name)) as member:
         content = member.read()
     try:
         return _read_array(BytesIO(content), len(content))
@@ -98,8 +169,8 @@ def _optional(archive: zipfile.ZipFile, name: str) -> NDArray | None:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _read_array(file: BinaryIO, size: int) -> NDArray:
-    """The array of a .npy stream of size bytes, allocated only if its header fits the size."""
+def _read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether columns follow each other, and type of a .npy stream."""
     version = npy_format.read_magic(file)
     if version == (1, 0):
         shape, fortran_order, dtype = npy_format.read_array_header_1_0(file)
@@ -109,6 +180,12 @@ def _read_array(file: BinaryIO, size: int) -> NDArray:
         raise ValueError(f"format version must be 1.0 or 2.0; got {version}")
     if dtype.kind not in "biuf":
         raise ValueError(f"numbers are needed; got an array of {dtype}")
+    return shape, fortran_order, dtype
+
+
+def _read_array(file: BinaryIO, size: int) -> NDArray:
+    """The array of a .npy stream of size bytes, allocated only if its header fits the size."""
+    shape, fortran_order, dtype = _read_header(file)
     promised, left = math.prod(shape) * dtype.itemsize, size - file.tell()
     if min(shape, default=0) < 0 or promised != left:
         raise ValueError(f"shape {shape} of {dtype} needs {promised} bytes; got {left}")

@@ -156,7 +156,7 @@ def _read_body(path: Path, file: BinaryIO, header: _Header) -> Columns:
     if header.encoding == "ascii":
         return read_ascii(path, header.num_lines, header.fields, header.count, bytes_left(file))
     if header.encoding == "binary":
-        return read_binary(file, header.fields, header.count)
+        return next(read_binary(file, header.fields, header.count))
     return _read_compressed(file, header)
 
 

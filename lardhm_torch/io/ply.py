@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -54,9 +55,15 @@ def read_ply(path: Path) -> Readout:
     Source: http://paulbourke.net/dataformats/ply/
     """
     with open(path, "rb") as file:
-        header = _read_header(file)
-        columns = _read_vertices(path, file, header)
+        (columns,) = _read_vertices(path, file, _read_header(file), max_points=None)
     return readout_from_columns(columns)
+
+
+def ply_pieces(path: Path, max_points: int) -> Iterator[Readout]:
+    """The same a piece of at most ``max_points`` at a time; a file of text all at once."""
+    with open(path, "rb") as file:
+        for columns in _read_vertices(path, file, _read_header(file), max_points):
+            yield readout_from_columns(columns)
 
 
 def _read_header(file: BinaryIO) -> _Header:
@@ -87,16 +94,20 @@ def _read_header(file: BinaryIO) -> _Header:
     raise AssertionError("header_lines raises before it ends")
 
 
-def _read_vertices(path: Path, file: BinaryIO, header: _Header) -> Columns:
-    """The named columns of the element vertex."""
+def _read_vertices(
+    path: Path, file: BinaryIO, header: _Header, max_points: int | None
+) -> Iterator[Columns]:
+    """The named columns of the element vertex, in one piece or several."""
     skip_lines = header.num_lines
     for element in header.elements:
         if element.name == "vertex":
             if element.has_list:
                 raise ValueError("vertices with list properties are not supported")
             if header.encoding == "ascii":
-                return read_ascii(path, skip_lines, element.fields, element.count, bytes_left(file))
-            return read_binary(file, element.fields, element.count)
+                yield read_ascii(path, skip_lines, element.fields, element.count, bytes_left(file))
+            else:
+                yield from read_binary(file, element.fields, element.count, max_points)
+            return
         skip_lines += element.count
         if header.encoding != "ascii":
             _skip_binary(file, element)

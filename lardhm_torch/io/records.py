@@ -64,8 +64,10 @@ def bytes_left(file: BinaryIO) -> int:
     return os.fstat(file.fileno()).st_size - file.tell()
 
 
-def read_binary(file: BinaryIO, fields: Sequence[Field], count: int) -> Columns:
-    """The named columns of count binary records at the file's position.
+def read_binary(
+    file: BinaryIO, fields: Sequence[Field], count: int, max_points: int | None = None
+) -> Iterator[Columns]:
+    """The named columns of count binary records at the file's position, all or so many at a time.
 
     Raises:
         ValueError: the file has fewer bytes than that.
@@ -81,11 +83,14 @@ def read_binary(file: BinaryIO, fields: Sequence[Field], count: int) -> Columns:
         if field.name in COLUMN_NAMES:
             wanted[field.name] = (np.dtype(field.format), offset)
         offset += field.num_bytes
-    records = np.fromfile(file, np.dtype((np.void, size)), count)
-    return {
-        name: np.ndarray(count, dtype, records, offset, (size,)).astype(np.float64)
-        for name, (dtype, offset) in wanted.items()
-    }
+    step = max_points or max(1, count)
+    for start in range(0, max(1, count), step):
+        rows = min(step, count - start)
+        records = np.fromfile(file, np.dtype((np.void, size)), rows)
+        yield {
+            name: np.ndarray(rows, dtype, records, offset, (size,)).astype(np.float64)
+            for name, (dtype, offset) in wanted.items()
+        }
 
 
 def read_ascii(

@@ -239,7 +239,7 @@ def _from_json(body: dict[str, Any]) -> Manifest:
     tiles = {}
     for name, entry in body["tiles"].items():
         try:
-            index = _index_of(name)
+            index = tile_index(name)
             tiles[index] = _tile_of(entry)
         except (TypeError, ValueError) as error:
             raise ValueError(f"tile {name!r}: {error}") from error
@@ -255,7 +255,8 @@ def _tile_of(entry: Any) -> Tile:
     return Tile(**{**entry, "bounds": tuple(_position(corner) for corner in bounds)})
 
 
-def _index_of(name: str) -> Index:
+def tile_index(name: str) -> Index:
+    """The index of a tile of that name; a ValueError where it is none."""
     parts = name.split("_")
     if not all(part.removeprefix("-").isdecimal() and len(part) < 16 for part in parts):
         raise ValueError("a tile's name must be whole numbers joined by _")

@@ -1,0 +1,147 @@
+"""Two tiled folders to one: of two robots, or of two machines that routed half the scans each."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from lardhm_torch.tiles.cluster_files import clusters_path
+from lardhm_torch.tiles.manifest import (
+    Index,
+    Manifest,
+    Tile,
+    read_manifest,
+    samples_path,
+    tile_path,
+    write_manifest,
+)
+from lardhm_torch.tiles.samples import Counts, Ledger, read_ledger, record_type, write_ledger
+
+PathLike = str | os.PathLike[str]
+
+
+def join_folders(first: PathLike, second: PathLike, target: PathLike) -> Manifest:
+    """Training points of both in a new folder, with those fitted tiles that are still true.
+
+    A tile that has no points of the other folder in or next to it stays as it is fitted; `fit_tiles`
+    fits the others. Both folders stay as they are.
+
+    Args:
+        first: gives seed and settings.
+        second: of the same world frame, edge, halo, kernel and training.
+        target: is made; must be new or empty.
+
+    Returns:
+        The manifest of the new folder.
+
+    Raises:
+        FileNotFoundError: a folder holds no tiled map, or no training points.
+        ValueError: they differ in how they are made, or target is not empty.
+    """
+    manifests = [read_manifest(folder) for folder in (first, second)]
+    ledgers = [read_ledger(folder) for folder in (first, second)]
+    for folder, ledger in zip((first, second), ledgers, strict=True):
+        if not ledger.complete:
+            raise ValueError(f"{folder} must be complete; run `lardhm tile` to its end")
+    shift = _index_shift(*manifests)
+    goal = Path(target)
+    goal.mkdir(parents=True, exist_ok=True)
+    if any(goal.iterdir()):
+        raise ValueError(f"target must be a new or empty folder; {goal} is not")
+    sources = [
+        _Source(Path(first), manifests[0], ledgers[0], (0,) * manifests[0].dim),
+        _Source(Path(second), manifests[1], ledgers[1], shift),
+    ]
+    for name in ("samples", "clusters", "tiles"):
+        (goal / name).mkdir()
+    tiles = {}
+    for source, other in (sources, sources[::-1]):
+        source.append_samples(goal)
+        tiles.update(source.copy_fitted(goal, other.cores))
+    ledger = Ledger(
+        tiles=_total(*(source.counts for source in sources)),
+        chunks=sum(part.chunks for part in ledgers),
+        rays=sum(part.rays for part in ledgers),
+        complete=True,
+    )
+    os.sync()
+    write_ledger(goal, ledger)
+    joined = replace(manifests[0], tiles=tiles)
+    write_manifest(goal, joined)
+    return joined
+
+
+def _index_shift(first: Manifest, second: Manifest) -> Index:
+    """What is added to an index of the second folder to get that of the first."""
+    for name in ("edge", "halo", "settings", "dtype", "sampling", "fitting"):
+        ours, theirs = getattr(first, name), getattr(second, name)
+        if ours != theirs:
+            raise ValueError(f"both folders must have the same {name}; got {ours} and {theirs}")
+    steps = [(b - a) / first.edge for a, b in zip(first.origin, second.origin, strict=True)]
+    if any(abs(step - round(step)) > 1e-6 for step in steps):
+        raise ValueError(
+            "both folders must have borders of tiles in the same places; "
+            f"got the origins {first.origin} and {second.origin} with an edge of {first.edge} m"
+        )
+    return tuple(round(step) for step in steps)
+
+
+def _total(first: Mapping[Index, Counts], second: Mapping[Index, Counts]) -> dict[Index, Counts]:
+    nothing = Counts()
+    return {
+        index: first.get(index, nothing).plus(second.get(index, nothing))
+        for index in {*first, *second}
+    }
+
+
+class _Source:
+    """One of the two folders, with indices as they are in the new one."""
+
+    def __init__(self, folder: Path, manifest: Manifest, ledger: Ledger, shift: Index) -> None:
+        self.folder, self.manifest, self.shift = folder, manifest, shift
+        self.counts = {self._there(index): counts for index, counts in ledger.tiles.items()}
+        self.cores = {index for index, counts in self.counts.items() if counts.core}
+
+    def append_samples(self, goal: Path) -> None:
+        """Records that count, behind those that are there."""
+        size = record_type(self.manifest.dim).itemsize
+        for index, counts in self.counts.items():
+            with (
+                open(samples_path(self.folder, self._here(index)), "rb") as ours,
+                open(samples_path(goal, index), "ab") as file,
+            ):
+                left = size * sum(counts)
+                while left and (content := ours.read(min(left, 1 << 24))):
+                    file.write(content)
+                    left -= len(content)
+            if left:
+                raise ValueError(f"{ours.name} is {left} bytes too short: tile the scans anew")
+
+    def copy_fitted(self, goal: Path, others: set[Index]) -> dict[Index, Tile]:
+        """Tiles far from the points of the other folder; their entries of the manifest."""
+        entries = {}
+        for index in sorted(self.cores):
+            ours = self._here(index)
+            if index not in others and clusters_path(self.folder, ours).is_file():
+                shutil.copyfile(clusters_path(self.folder, ours), clusters_path(goal, index))
+            entry = self.manifest.tiles.get(ours)
+            around = itertools.product((-1, 0, 1), repeat=len(index))
+            near = (tuple(i + s for i, s in zip(index, step, strict=True)) for step in around)
+            if (
+                entry is not None
+                and tile_path(self.folder, ours).is_file()
+                and others.isdisjoint(near)
+            ):
+                shutil.copyfile(tile_path(self.folder, ours), tile_path(goal, index))
+                entries[index] = entry
+        return entries
+
+    def _here(self, index: Index) -> Index:
+        return tuple(i - s for i, s in zip(index, self.shift, strict=True))
+
+    def _there(self, index: Index) -> Index:
+        return tuple(i + s for i, s in zip(index, self.shift, strict=True))

@@ -1,0 +1,147 @@
+"""One tile from its points: clusters of its core, weights among the clusters of its neighbors.
+
+A tile of a large map is no map of its own. What it takes from the others, so that all together are
+as good as one map fitted at once (docs/scale.md has the measurements):
+
+- how many clusters it gets: its share of the number that all points would get (`Budget`);
+- how much a point of each class counts in the loss: the same in every tile;
+- at its border, the clusters of its neighbors stand in their places while its weights are trained,
+  on the points just across the border too; what the neighbors' weights become there is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.clustering import (
+    MIN_COUNT,
+    POINTS_PER_CLUSTER,
+    Clusters,
+    cluster_points,
+    concatenate_clusters,
+    factor_covariances,
+)
+from lardhm_torch.features import Kernel, raw_factors
+from lardhm_torch.fitting import FitConfig, fit_weights, training_order
+from lardhm_torch.tiles.samples import Counts, TilePoints
+
+# Clusters of best accuracy lie denser where points do, but less so: where there are twice the
+# points, 2^0.8 times the occupied and 2^0.6 times the free clusters.
+DENSITY_POWERS = (0.8, 0.6)
+LEAST_BATCH = 64  # a tile of few points needs steps enough, too
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a tile's fit takes from the number of points in all tiles.
+
+    Args:
+        clusters_a_unit: of each class, occupied first: clusters of a tile with n points are this
+            times n to the class's power of density.
+        loss_factors: (2,) of a free and of an occupied point.
+    """
+
+    clusters_a_unit: tuple[float, float]
+    loss_factors: tuple[float, float]
+
+    def num_clusters(self, counts: Counts) -> tuple[int, int]:
+        """Of the occupied and of the free points of a tile."""
+        occupied, free = (
+            min(max(1, n // MIN_COUNT), max(1, round(unit * n**power))) if n else 0
+            for n, unit, power in zip(counts, self.clusters_a_unit, DENSITY_POWERS, strict=False)
+        )
+        return occupied, free
+
+
+def make_budget(tiles: Mapping[Any, Counts], config: FitConfig) -> Budget:
+    """One cluster a class for every `POINTS_PER_CLUSTER` hits of all tiles, shared out by density.
+
+    The classes share the loss over all tiles as they do over all points of one map.
+    """
+    hits, free = (sum(counts[kind] for counts in tiles.values()) for kind in (0, 1))
+    total = max(1.0, (hits or free) / POINTS_PER_CLUSTER)
+    units = [
+        total / max(1.0, sum(counts[kind] ** power for counts in tiles.values()))
+        for kind, power in enumerate(DENSITY_POWERS)
+    ]
+    factors = (1.0, 1.0)
+    if config.balance and hits and free:
+        share, points = config.occupied_share, hits + free
+        factors = ((1 - share) * points / free, share * points / hits)
+    return Budget((units[0], units[1]), factors)
+
+
+class TileClusters(NamedTuple):
+    """M clusters, and (M,) which of them are occupied."""
+
+    clusters: Clusters
+    is_occupied: Tensor
+
+    def moved(self, shift: Tensor) -> TileClusters:
+        """The same in another frame, (D,) further [m]."""
+        return self._replace(clusters=replace(self.clusters, means=self.clusters.means + shift))
+
+    def rows(self, which: Tensor) -> TileClusters:
+        """Those of a mask."""
+        old = self.clusters
+        kept = Clusters(old.counts[which], old.means[which], old.scatters[which])
+        return TileClusters(kept, self.is_occupied[which])
+
+
+def cluster_tile(
+    tile: TilePoints, num_clusters: tuple[int, int], rng: torch.Generator
+) -> TileClusters:
+    """Both classes of a tile's core, clustered apart; the occupied clusters first."""
+    parts = []
+    for label, total in zip((1, 0), num_clusters, strict=True):
+        members = tile.points[tile.in_core & (tile.labels == label)]
+        if len(members):
+            parts.append((cluster_points(members, total, rng), bool(label)))
+    kinds = [torch.full_like(found.counts, kind, dtype=torch.bool) for found, kind in parts]
+    return TileClusters(concatenate_clusters([found for found, _ in parts]), torch.cat(kinds))
+
+
+def train_tile(
+    tile: TilePoints,
+    own: TileClusters,
+    around: list[TileClusters],
+    budget: Budget,
+    task: TrainingTask,
+) -> Tensor:
+    """(M,) weights of a tile's own clusters.
+
+    Args:
+        tile: points of the core and of the halo.
+        own: M clusters of the core.
+        around: the neighbors' clusters that reach into the halo, same frame.
+        budget: what a point counts.
+        task: kernel, settings, random state.
+    """
+    clusters = concatenate_clusters([part.clusters for part in (own, *around)])
+    raw = raw_factors(factor_covariances(clusters.covariances, task.kernel.min_lengthscale))
+    rows = max(LEAST_BATCH, len(tile.points) // 128)
+    config = replace(task.config, batch_size=task.config.batch_size or rows)
+    order = training_order(tile.points, config.rows_a_batch(len(tile.points)), task.rng)
+    points, labels = tile.points[order], tile.labels[order]
+    index = native.build_index(clusters.means, task.kernel.num_neighbors)
+
+    def features_of(part: slice) -> tuple[Tensor, Tensor]:
+        return native.nearest_features(points[part], clusters.means, raw, task.kernel, index)
+
+    start = clusters.means.new_zeros(len(clusters))
+    factors = labels.new_tensor(budget.loss_factors)[labels.long()]
+    return fit_weights(features_of, labels, start, config, factors=factors)[: len(own.clusters)]
+
+
+class TrainingTask(NamedTuple):
+    """What the training of every tile needs beside points and clusters."""
+
+    kernel: Kernel
+    config: FitConfig
+    rng: torch.Generator
