@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -67,8 +66,9 @@ def questions(num_points: int, num_tiles: int, order: str, seed: int = 1) -> tor
 
 
 def peak_megabytes() -> float:
-    """Largest resident set of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Largest resident set of this process so far (not of the one that started it)."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def seconds(ask: object, points: torch.Tensor) -> tuple[float, torch.Tensor]:
@@ -106,6 +106,7 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=512, help="memory limit of the map [MiB]")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--folder", help="where the map is, or will be, kept")
+    parser.add_argument("--orders", nargs="*", default=("grouped", "random"))
     parser.add_argument("--order", choices=("grouped", "random"), default="grouped")
     parser.add_argument("--measure", choices=("single", "tiled"))
     arguments = parser.parse_args()
@@ -120,7 +121,7 @@ def main() -> None:
             model = city(arguments.tiles)
             model.save(folder / "map.pt")
             TiledMap.split(model, folder / "tiles", EDGE)
-        for order in ("grouped", "random"):
+        for order in arguments.orders:
             rows = {}
             for name in ("single", "tiled"):
                 words = [
