@@ -68,7 +68,6 @@ def join_folders(first: PathLike, second: PathLike, target: PathLike) -> Manifes
         rays=sum(part.rays for part in ledgers),
         complete=True,
     )
-    os.sync()
     write_ledger(goal, ledger)
     joined = replace(manifests[0], tiles=tiles)
     write_manifest(goal, joined)

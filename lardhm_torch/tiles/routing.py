@@ -247,7 +247,6 @@ class _Router:
         self.buffers, self.buffered = {}, 0
 
     def _commit(self, complete: bool) -> Ledger:
-        os.sync()  # the records must be on disk before they count
         ledger = Ledger(tiles=self.tiles, chunks=self.chunks, rays=self.rays, complete=complete)
         write_ledger(self.folder, ledger)
         return ledger

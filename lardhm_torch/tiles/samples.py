@@ -3,7 +3,9 @@
 A record is a point relative to the tile's lower corner (float32, so micrometers in a tile of 20 m)
 and one byte, whose bits say whether the point is `OCCUPIED`, and whether it is of the tile's `HALO`:
 a copy of a point that lies just across the border. Files only grow. The ledger says how many records
-of each file count; what a killed run left behind them is cut off by the next writer.
+of each file count; what a killed run left behind them is cut off by the next writer. Nothing is
+forced to the disk (that would take milliseconds a tile): a file that a power failure cut is noticed by
+its size.
 """
 
 from __future__ import annotations
@@ -191,7 +193,7 @@ class TilePoints(NamedTuple):
 
 def unpack(records: Records, device: torch.device, dtype: torch.dtype) -> TilePoints:
     """Records as tensors."""
-    points = torch.from_numpy(np.ascontiguousarray(records["position"]))
-    kind = torch.from_numpy(np.ascontiguousarray(records["kind"])).to(device)
+    points = torch.from_numpy(records["position"].copy())
+    kind = torch.from_numpy(records["kind"].copy()).to(device)
     labels = (kind & OCCUPIED).to(dtype)
     return TilePoints(points.to(device, dtype), labels, (kind & HALO) == 0)
