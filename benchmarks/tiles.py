@@ -103,7 +103,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tiles", type=int, default=1000)
     parser.add_argument("--points", type=int, default=10_000_000)
-    parser.add_argument("--limit", type=int, default=512, help="memory limit of the map [MiB]")
+    parser.add_argument("--limit", type=int, default=384, help="memory limit of the map [MiB]")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--folder", help="where the map is, or will be, kept")
     parser.add_argument("--orders", nargs="*", default=("grouped", "random"))

@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from small_maps import wall_map
-from tiled_maps import EDGE, F64, border_points, random_map, tiled
+from tiled_maps import EDGE, F64, border_points, random_map, reframed, tiled
 
 from lardhm_torch import LardHilbertMap, TiledMap, extract_mesh, raycast, sample_rays
 from lardhm_torch.exploring import frontiers
@@ -13,7 +15,7 @@ from lardhm_torch.scans import split_rays
 from lardhm_torch.segments import expected_range, segment_hazard
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
-from lardhm_torch.tiles.manifest import tile_indices
+from lardhm_torch.tiles.manifest import tile_indices, tile_path, write_manifest
 from lardhm_torch.tiles.store import cluster_bytes
 
 TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
@@ -44,19 +46,46 @@ def test_answers_at_borders_are_those_of_the_merged_map(
     tiles = tiled(random_map(1, dim, dtype), tmp_path, monkeypatch, block_clusters)
     assert len(tiles.manifest.tiles) > 10
     assert tiles._layout.block_tiles < 4
-    assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 10_000))
+    assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 5_000))
+
+
+@both
+def test_tiles_of_different_frames_answer_as_one(dtype, tmp_path, monkeypatch):
+    model = random_map(2, dtype=dtype)
+    tiles = reframed(tiled(model, tmp_path, monkeypatch))
+    assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 5_000))
+    near = border_points(tiles, 100)
+    assert (tiles(near) - model(near)).abs().median() < 1e-5
+    part = tiles.merge((near[0], near[0]))
+    torch.testing.assert_close(part(near[0]), tiles.merge()(near[0]))
+
+
+@both
+def test_far_from_the_origin_parts_keep_their_digits(dtype, tmp_path, monkeypatch):
+    """A map at 100 km, where float32 in the map's frame would know no centimeters."""
+    model = random_map(2, dtype=dtype)
+    tiled(model, tmp_path, monkeypatch)
+    tiles = reframed(TiledMap.open(tmp_path / "tiles"))
+    points = border_points(tiles, 1000)
+    origin = tuple(value - 25_000 * EDGE for value in tiles.manifest.origin)
+    moved = {tuple(i + 25_000 for i in index): t for index, t in tiles.manifest.tiles.items()}
+    for index, there in zip(tiles.manifest.tiles, moved, strict=True):
+        tile_path(tiles.folder, index).rename(tile_path(tiles.folder, there))
+    write_manifest(tiles.folder, replace(tiles.manifest, origin=origin, tiles=moved))
+    far = TiledMap.open(tiles.folder)
+    assert (far(points) - model.double()(points)).abs().median() < 1e-6
 
 
 @pytest.mark.parametrize("name", ["kitti00_mulls", "balm_realworld"])
 def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
     name, data, tmp_path, monkeypatch
 ):
-    scans, _ = split_rays(load_scans(data / name), 0.05, seed=0)
+    scans, _ = split_rays(load_scans(data / name), 0.03, seed=0)
     samples = sample_rays(scans, seed=0)
     model = LardHilbertMap().fit(samples.points, samples.labels)
-    monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 500)
+    monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 300)
     for dtype in (torch.float32, F64):
-        tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 10.0)
+        tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 15.0)
         assert tiles._layout.block_tiles < 4
         assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 100_000))
 
@@ -86,7 +115,7 @@ def test_a_part_answers_inside_its_bounds_like_the_whole(tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_every_neighbor_that_speaks_is_in_a_needed_tile(seed, tmp_path, monkeypatch):
     tiles = tiled(random_map(seed), tmp_path, monkeypatch)
     plan, model = layout_of(tiles.manifest), tiles.merge()
@@ -196,16 +225,16 @@ def test_a_mesh_across_many_blocks_is_that_of_the_merged_map(color, tmp_path, mo
 
 
 def test_rays_end_where_they_do_in_the_merged_map(tmp_path, monkeypatch):
-    tiles = tiled(random_map(clusters=1000), tmp_path, monkeypatch)
+    tiles = tiled(random_map(clusters=600), tmp_path, monkeypatch)
     single = tiles.merge()
     rng = torch.Generator().manual_seed(0)
-    origins = 100 + 20 * torch.rand(100, 3, generator=rng, dtype=F64)
-    directions = torch.randn(100, 3, generator=rng, dtype=F64)
+    origins = 100 + 20 * torch.rand(60, 3, generator=rng, dtype=F64)
+    directions = torch.randn(60, 3, generator=rng, dtype=F64)
     step = surface_step(single)
     for surface in ("peak", "crossing"):
         options = {"max_range": 8.0, "step": step, "surface": surface}
         expected = raycast(single, origins, directions, **options)
-        assert 10 < expected.isfinite().sum() < 100
+        assert 5 < expected.isfinite().sum() < 60
         torch.testing.assert_close(raycast(tiles, origins, directions, **options), expected)
     assert raycast(tiles, origins + 1e5, directions, 5.0).isinf().all()
     unknown_stops = {"max_range": 5.0, "threshold": 0.1, "surface": "crossing"}
@@ -230,7 +259,7 @@ def test_segments_and_frontiers_are_those_of_the_merged_map(tmp_path, monkeypatc
 
 def test_variances_are_those_of_the_merged_map(tmp_path, monkeypatch):
     model = random_map()
-    points = border_points(tiled(model, tmp_path, monkeypatch), 1000)
+    points = border_points(tiled(model, tmp_path, monkeypatch), 300)
     model.fit_uncertainty(points, (model(points) > 0.5).float())
     tiles = tiled(model, tmp_path / "sure", monkeypatch)
     for ask in ("variance", "bayesian_probability"):
@@ -240,17 +269,17 @@ def test_variances_are_those_of_the_merged_map(tmp_path, monkeypatch):
 
 
 def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
-    model = random_map(clusters=3000)
+    model = random_map(clusters=1000)
     tiled(model, tmp_path, monkeypatch)
-    limit = 5000 * cluster_bytes(3, F64)
+    limit = 2200 * cluster_bytes(3, F64)
     tiles = TiledMap.open(tmp_path / "tiles", memory_limit=limit)
-    points = border_points(tiled(model, tmp_path / "again", monkeypatch), 1500)
+    points = border_points(tiled(model, tmp_path / "again", monkeypatch), 60)
     expected = model(points)
-    for some in points.split(300):
+    for some in points.split(20):
         tiles(some)
         held = sum(m.centers.numel() for m, _ in tiles._cache._entries.values()) // 3
         assert held * cluster_bytes(3, F64) == tiles._cache.num_bytes
-        assert held <= 5000
+        assert held <= 2200
     torch.testing.assert_close(tiles(points), expected)
 
 

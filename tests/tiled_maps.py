@@ -1,14 +1,18 @@
 """Random maps, and the same in tiles, for the tests of tiled maps."""
 
+from dataclasses import replace
+
 import torch
 
 from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState, assign_state
 from lardhm_torch.tiles import layout
+from lardhm_torch.tiles.manifest import tile_path, tile_record, write_manifest
+from lardhm_torch.tiles.store import joined
 
 F64 = torch.float64
-EDGE = 4.0
+EDGE = 6.0
 
 
 def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
@@ -18,7 +22,7 @@ def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
     centers[::2, 0] /= 4
     factors = 0.1 * torch.randn(clusters, dim, dim, generator=rng, dtype=F64).tril(-1)
     sizes = 0.05 + 0.3 * torch.rand(clusters, dim, generator=rng, dtype=F64)
-    sizes[::20] *= 4
+    sizes[::20] *= 2
     factors += torch.diag_embed(sizes)
     weights = 4 * torch.randn(clusters, generator=rng, dtype=F64)
     counts = torch.randint(1, 50, (clusters,), generator=rng)
@@ -34,6 +38,18 @@ def tiled(model, folder, monkeypatch, block_clusters=64):
     """The map in tiles, answered in blocks of few clusters, so that there are many."""
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", block_clusters)
     return TiledMap.split(model, folder / "tiles", EDGE)
+
+
+def reframed(tiles):
+    """The same folder with every tile in a frame of its own, as fitted tiles are; opened anew."""
+    entries = {}
+    for index, tile in tiles.manifest.tiles.items():
+        path = tile_path(tiles.folder, index)
+        model = LardHilbertMap.load(path)
+        joined([model], model.settings, model.origin + 3.0 + EDGE * torch.tensor(index)).save(path)
+        entries[index] = tile_record(LardHilbertMap.load(path), path, tile.num_points)
+    write_manifest(tiles.folder, replace(tiles.manifest, tiles=entries))
+    return TiledMap.open(tiles.folder)
 
 
 def border_points(tiles, count, seed=0, within=0.5):

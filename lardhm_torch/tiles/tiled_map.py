@@ -25,6 +25,7 @@ from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore, cluster
 
 MEMORY_LIMIT = 1 << 30  # bytes of clusters held at a time
 WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts")
+SAME_FRAME = 512.0  # [m] from the origin; there float32 rounds to 30 micrometers
 POINTS_AT_ONCE = 1 << 22  # points sorted by block at a time
 NUMBERS_AT_ONCE = 1 << 18  # points whose blocks are looked up at a time
 
@@ -309,25 +310,36 @@ class TiledMap:
         return model
 
     def _joined(self, tiles: list[LardHilbertMap], origin: Tensor | None = None) -> LardHilbertMap:
-        """One map of tiles; in their own frame if they share one, else in one amid their origins."""
-        if origin is None and tiles:
-            origins = torch.stack([tile.origin for tile in tiles])
-            same = bool((origins == origins[0]).all())
-            middle = (origins.amin(dim=0) + origins.amax(dim=0)) / 2
-            origin = origins[0] if same else middle.round()
-        model = joined(tiles, self.settings, self.origin if origin is None else origin)
+        """One map of tiles.
+
+        Near the map's origin it has that frame, like the whole in one piece: in another, float32
+        would round points and centers otherwise, and who is the k-th nearest is sometimes a matter
+        of the last digit. Farther away that frame would lose what float32 can tell apart in one
+        amid the tiles.
+        """
+        if origin is None:
+            origin = self.origin
+            if tiles:
+                origins = torch.stack([tile.origin for tile in tiles])
+                lower, upper = origins.amin(dim=0), origins.amax(dim=0)
+                far = torch.maximum(upper - self.origin, self.origin - lower).max()
+                if far > SAME_FRAME:
+                    origin = ((lower + upper) / 2).round()
+        model = joined(tiles, self.settings, origin)
         return model.to(self._store.device, self._store.dtype)
 
     def _make_room(self, rows: Tensor, what: str) -> None:
-        """Forget what is unused longest, so that these tiles fit the limit."""
-        clusters = 2 * int(self._layout.counts[rows].sum())  # of the tiles and of what they make
-        needed = clusters * cluster_bytes(self.dim, self._store.dtype)
+        """Forget what is unused longest, so that these tiles and what they make fit the limit."""
+        clusters = int(self._layout.counts[rows].sum())
+        needed = 2 * clusters * cluster_bytes(self.dim, self._store.dtype)
         if needed > self.memory_limit:
             raise ValueError(
                 f"memory_limit must be {needed} bytes or more to hold {what}; "
                 f"got {self.memory_limit}"
             )
-        self._cache.make_room(needed)
+        there = [self._cache.get(self._layout.indices[row]) for row in rows.tolist()]
+        clusters = 2 * clusters - sum(len(tile) for tile in there if tile is not None)
+        self._cache.make_room(clusters * cluster_bytes(self.dim, self._store.dtype))
 
     def _whole(self) -> LardHilbertMap:
         model = self._cache.get("whole")
