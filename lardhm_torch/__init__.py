@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lardhm_torch.scans import Scans, split_rays
     from lardhm_torch.simulation import simulate_room
     from lardhm_torch.streaming import StreamConfig, resume_stream, stream_scans
+    from lardhm_torch.tiles.tiled_map import TiledMap
     from lardhm_torch.tuning import TuneConfig, fine_tune
 
 _ROOM_OF = {
@@ -28,6 +29,7 @@ _ROOM_OF = {
     "SamplingConfig": "sampling",
     "Scans": "scans",
     "StreamConfig": "streaming",
+    "TiledMap": "tiles.tiled_map",
     "TuneConfig": "tuning",
     "UpdateConfig": "incremental",
     "extract_mesh": "meshing",
@@ -53,6 +55,7 @@ __all__ = [
     "SamplingConfig",
     "Scans",
     "StreamConfig",
+    "TiledMap",
     "TuneConfig",
     "UpdateConfig",
     "extract_mesh",

@@ -53,7 +53,7 @@ def frontiers(
     steps = round(wall_margin / resolution)
     unknown = ~occupied & ~free & ~_grow(occupied, steps, diagonal=True)
     border = free & _grow(unknown, 1, diagonal=False)
-    axes = grid_axes(lower, upper, resolution, model.centers.device)
+    axes = grid_axes(lower, upper, resolution, model.origin.device)
     place = border.nonzero()
     points = torch.stack([axis[i] for axis, i in zip(axes, place.T, strict=True)], dim=1)
     return Frontiers(points, _groups(border)[border])

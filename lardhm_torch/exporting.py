@@ -121,7 +121,7 @@ def _known_cells(
     for blocks in active_blocks(lower, upper, cells).split(BLOCK_POINTS // (8 * len(local))):
         index = (blocks[:, None] * BLOCK_CELLS + local).reshape(-1, 3)
         centers = first + resolution * index[(index < cells).all(dim=1)].double()
-        points = (centers[:, None] + parts).to(model.centers.device)
+        points = (centers[:, None] + parts).to(model.origin.device)
         log_odds = model.log_odds(points).float().amax(dim=1).cpu()
         known = log_odds.abs() >= EVIDENCE
         yield centers[known], log_odds[known]

@@ -12,7 +12,14 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.native import nearest_centers
-from lardhm_torch.querying import EVIDENCE, cluster_boxes, grid_axes, lattice_values
+from lardhm_torch.querying import (
+    EVIDENCE,
+    cluster_boxes,
+    grid_axes,
+    lattice_values,
+    local_parts,
+    pieces,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -71,15 +78,14 @@ def extract_mesh(
 class SurfaceLattice(NamedTuple):
     """Log-odds on the blocks of a lattice in which a surface may lie.
 
-    ``corner`` (3,) world [m], ``resolution`` [m], ``cells`` (3,) number of cells, ``supporters``
-    (S,) clusters that pull to the threshold's side, and the blocks as pairs of the first cell (3,)
-    and values (n + 1, n + 1, n + 1); a generator, unless ``keep`` made it a list to march again.
+    ``corner`` (3,) world [m], ``resolution`` [m], ``cells`` (3,) number of cells, and the blocks as
+    pairs of the first cell (3,) and values (n + 1, n + 1, n + 1); a generator, unless ``keep`` made
+    it a list to march again.
     """
 
     corner: Tensor
     resolution: float
     cells: Tensor
-    supporters: Tensor
     blocks: Iterable[tuple[Tensor, np.ndarray]]
 
 
@@ -93,9 +99,7 @@ def surface_lattice(
     progress: bool = False,
 ) -> SurfaceLattice:
     """What `lattice_mesh` marches on: good for all thresholds on the same side of 1/2."""
-    chosen = (model.weights > 0) if threshold >= 0.5 else (model.weights < 0)
-    supporters = chosen.nonzero().squeeze(1)
-    lower, upper = (box[supporters].cpu() for box in cluster_boxes(model))
+    lower, upper = (box.cpu() for box in cluster_boxes(model, _side(threshold)))
     if bounds is not None:
         corner, end = (torch.as_tensor(b, dtype=torch.float64).cpu() for b in bounds)
         if len(grid_axes(corner, end, resolution)) != 3:
@@ -103,14 +107,14 @@ def surface_lattice(
         touching = ((upper >= corner) & (lower <= end)).all(dim=1)
         lower, upper = lower[touching].maximum(corner), upper[touching].minimum(end)
     if len(lower) == 0:
-        return SurfaceLattice(torch.zeros(3).double(), resolution, torch.ones(3), supporters, [])
+        return SurfaceLattice(torch.zeros(3).double(), resolution, torch.ones(3), [])
     if bounds is None:
         corner = lower.amin(dim=0)
         end = upper.amax(dim=0) + resolution  # whole cells cover the boxes
     cells = ((end - corner) / resolution + 1e-6).floor().long().clamp(min=1)
     active = active_blocks((lower - corner) / resolution, (upper - corner) / resolution, cells)
     blocks = _block_values(model, corner, resolution, active, cells, progress)
-    return SurfaceLattice(corner, resolution, cells, supporters, list(blocks) if keep else blocks)
+    return SurfaceLattice(corner, resolution, cells, list(blocks) if keep else blocks)
 
 
 def lattice_mesh(
@@ -127,10 +131,10 @@ def lattice_mesh(
     if len(faces) == 0:
         return _to_mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     world = vertices * lattice.resolution + lattice.corner.numpy()
-    nearest = _nearest_supporters(model, lattice.supporters, world)
-    mesh = _to_mesh(world, faces, _vertex_colors(model, world, nearest, color))
+    support = _nearest_support(model, world, _side(threshold))
+    mesh = _to_mesh(world, faces, _vertex_colors(model, world, support, color))
     if evidence is not None:
-        seen = _has_evidence(model, mesh, nearest, level, evidence)
+        seen = _has_evidence(model, mesh, support.thickness, level, evidence)
         mesh.update_faces(seen[faces].all(axis=1))
     mesh.remove_unreferenced_vertices()
     return mesh
@@ -143,7 +147,7 @@ def _check_meshing(
         raise ValueError(
             f"a mesh needs a 3-D map; got {model.dim}-D. For 2-D use query_slice or query_grid"
         )
-    if len(model.centers) == 0:
+    if not any(len(piece.centers) for piece in pieces(model)):
         raise ValueError("the map must hold clusters to have a surface; it is empty: fit it first")
     if not (resolution > 0 and math.isfinite(resolution)):
         raise ValueError(f"resolution must be > 0 m and finite; got {resolution}")
@@ -174,7 +178,7 @@ def _block_values(
     """First cell (3,) and log-odds of every block, those inside the bounds."""
     from tqdm import tqdm
 
-    device = model.centers.device
+    device = model.origin.device
     for block in tqdm(blocks, desc="mesh", disable=None if progress else True):
         first_cell = block * BLOCK_CELLS
         last_cell = (first_cell + BLOCK_CELLS).minimum(cells)
@@ -229,24 +233,46 @@ def _join(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return vertices[kept], faces[~collapsed]
 
 
-def _nearest_supporters(model: Any, supporters: Tensor, world: np.ndarray) -> np.ndarray:
-    """(V,) supporting cluster with the nearest center."""
-    centers = model.centers.detach()[supporters]
-    points = torch.as_tensor(world, device=centers.device) - model.origin
-    nearest = nearest_centers(points.to(centers.dtype), centers, 1).squeeze(1)
-    return supporters[nearest].cpu().numpy()
+class _Support(NamedTuple):
+    """Of V vertices: center (V, 3) float64 world [m] of the nearest supporting cluster, and its
+    smallest standard deviation (V,) [m]; NaN and 0 where nothing supports.
+    """
+
+    centers: Tensor
+    thickness: Tensor
+
+
+def _side(threshold: float) -> int:
+    """Sign of the weights that pull away from 1/2 to the threshold's side."""
+    return 1 if threshold >= 0.5 else -1
+
+
+@torch.no_grad()
+def _nearest_support(model: Any, world: np.ndarray, sign: int) -> _Support:
+    points = torch.as_tensor(world, device=model.origin.device)
+    support = _Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
+    for rows, part in local_parts(model, points, points):
+        supporters = (part.weights * sign > 0).nonzero().squeeze(1)
+        if len(supporters) == 0:
+            continue
+        centers = part.centers.detach()[supporters]
+        local = (points[rows] - part.origin).to(centers.dtype)
+        nearest = nearest_centers(local, centers, 1).squeeze(1)
+        stds = torch.linalg.svdvals(part.scale_tril.detach()[supporters].double())
+        support.centers[rows] = centers[nearest].double() + part.origin
+        support.thickness[rows] = stds[nearest, -1]
+    return support
 
 
 @torch.no_grad()
 def _has_evidence(
-    model: Any, mesh: trimesh.Trimesh, nearest: np.ndarray, level: float, evidence: float
+    model: Any, mesh: trimesh.Trimesh, thickness: Tensor, level: float, evidence: float
 ) -> np.ndarray:
     """(V,) whether log-odds are clearly above the level behind a vertex and clearly below in front."""
-    device = model.centers.device
-    thickness = torch.linalg.svdvals(model.scale_tril.double())[:, -1]
+    device = model.origin.device
     vertices = torch.as_tensor(np.array(mesh.vertices), device=device)
     normals = torch.as_tensor(np.array(mesh.vertex_normals), device=device)
-    steps = normals * thickness[torch.as_tensor(nearest, device=device), None]
+    steps = normals * thickness[:, None]
     depths = torch.tensor(PROBES, dtype=torch.float64, device=device)[:, None, None]
     result = []
     for start, step in zip(
@@ -259,7 +285,7 @@ def _has_evidence(
 
 
 def _vertex_colors(
-    model: Any, world: np.ndarray, nearest: np.ndarray, color: str | None
+    model: Any, world: np.ndarray, support: _Support, color: str | None
 ) -> np.ndarray | None:
     """(V, 4) RGBA of the vertices, or None for no colors."""
     from matplotlib import colormaps
@@ -267,16 +293,23 @@ def _vertex_colors(
     if color is None or len(world) == 0:
         return None
     if color == "cluster":
-        return colormaps["tab20"](nearest * 7 % 20, bytes=True)
+        return colormaps["tab20"](_shades(support.centers), bytes=True)
     if color == "probability":
         with torch.no_grad():
-            at_centers = model(model.centers.double() + model.origin).cpu().numpy()
-        return colormaps["viridis"](2 * at_centers[nearest] - 1, bytes=True)
+            at_centers = model(support.centers).cpu().numpy()
+        return colormaps["viridis"](2 * at_centers - 1, bytes=True)
     if color == "variance":
         places = torch.as_tensor(world, device=model.origin.device)
         variance = torch.cat([model.variance(part) for part in places.split(CHUNK_VERTICES)])
         return colormaps["plasma"](_stretch(variance.double().cpu().numpy()), bytes=True)
     return colormaps["viridis"](_stretch(world[:, 2]), bytes=True)
+
+
+def _shades(centers: Tensor) -> np.ndarray:
+    """(V,) one of 20 for each center (V, 3), by its place in millimeters: neighbors differ mostly."""
+    place = (torch.nan_to_num(centers) * 1e3).round().long().cpu()
+    mixed = (place * torch.tensor([73856093, 19349663, 83492791])).sum(dim=1)
+    return (((mixed * 2654435761) >> 16) % 20).numpy()
 
 
 def _stretch(values: np.ndarray) -> np.ndarray:

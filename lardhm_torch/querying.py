@@ -1,12 +1,14 @@
 """Questions to a map at points: lattices, slices, bounds, gradients.
 
 A map is anything with the members of `LardHilbertMap` that are used here: ``log_odds(points)``,
-``centers``, ``scale_tril``, ``weights``, ``origin`` and ``dim``.
+``centers``, ``scale_tril``, ``weights``, ``origin`` and ``dim``. One that is too large to have these
+tensors in one piece, a `tiles.TiledMap`, has ``pieces()`` and ``local_parts(lower, upper)``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -75,7 +77,7 @@ def query_grid(model: Any, lower: Any, upper: Any, resolution: float) -> Tensor:
 
     The result has the map's dtype and device.
     """
-    axes = grid_axes(lower, upper, resolution, model.centers.device)
+    axes = grid_axes(lower, upper, resolution, model.origin.device)
     if len(axes) != model.dim:
         raise ValueError(f"lower and upper must have {model.dim} coordinates; got {len(axes)}")
     return lattice_values(model, axes, probability=True)
@@ -147,20 +149,44 @@ def map_bounds(model: Any, margin: float = 0.0) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: the map is empty.
     """
-    if len(model.centers) == 0:
-        raise ValueError("the map must hold clusters to have bounds; it is empty: fit it first")
     lower, upper = cluster_boxes(model)
+    if len(lower) == 0:
+        raise ValueError("the map must hold clusters to have bounds; it is empty: fit it first")
     return lower.amin(dim=0) - margin, upper.amax(dim=0) + margin
 
 
-def cluster_boxes(model: Any) -> tuple[Tensor, Tensor]:
+def cluster_boxes(model: Any, sign: int = 0) -> tuple[Tensor, Tensor]:
     """(M, D) and (M, D) corners of the boxes around each cluster's three standard deviations.
 
     The standard deviation along axis d is the length of row d of the factor. World frame, float64.
+    With a sign of 1 or -1 only of the clusters whose weights have it.
     """
-    reach = NUM_STDS * torch.linalg.vector_norm(model.scale_tril.detach().double(), dim=2)
-    centers = model.centers.detach().double() + model.origin
-    return centers - reach, centers + reach
+    boxes = []
+    for piece in pieces(model):
+        chosen = piece.weights.detach() * sign > 0 if sign else slice(None)
+        factors = piece.scale_tril.detach()[chosen].double()
+        reach = NUM_STDS * torch.linalg.vector_norm(factors, dim=2)
+        centers = piece.centers.detach()[chosen].double() + piece.origin
+        boxes.append((centers - reach, centers + reach))
+    if not boxes:
+        boxes = [(model.origin.new_zeros(0, model.dim),) * 2]
+    return torch.cat([lower for lower, _ in boxes]), torch.cat([upper for _, upper in boxes])
+
+
+def pieces(model: Any) -> Iterable[Any]:
+    """Maps that together hold every cluster once: the map itself, or its tiles one by one."""
+    return model.pieces() if hasattr(model, "pieces") else (model,)
+
+
+def local_parts(model: Any, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, Any]]:
+    """Numbers of some of N boxes, (N, D) to (N, D) world [m], and a map that answers inside of them.
+
+    All numbers with the map itself; of a tiled map those of boxes near each other, and a part of it.
+    """
+    if hasattr(model, "local_parts"):
+        yield from model.local_parts(lower, upper)
+    else:
+        yield torch.arange(len(lower), device=lower.device), model
 
 
 def occupancy_gradient(model: Any, points: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.bounding import Cells, ceiling_box, cover_cells, log_odds_ceiling
-from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE
+from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, local_parts
 
 BISECTIONS = 16  # a step of 5 cm is narrowed down to below 1 µm
 STRIDE = 4  # steps of a block, which is asked as a whole
@@ -108,7 +108,24 @@ def raycast(
     if not 0 < threshold < 1:
         raise ValueError(f"threshold must be between 0 and 1, both excluded; got {threshold}")
     origins, directions = unit_rays(model, origins, directions)
-    step = min(surface_step(model) if step is None else step, max_range)
+    result = origins.new_full((len(origins),), torch.inf)
+    ends = origins + max_range * directions
+    for rows, part in local_parts(model, origins.minimum(ends), origins.maximum(ends)):
+        spacing = min(ray_step(model, part, max_range) if step is None else step, max_range)
+        rays = _Rays(origins[rows], directions[rows], spacing, max_range)
+        result[rows] = _raycast(part, rays, threshold, surface)
+    return result
+
+
+def ray_step(model: Any, part: Any, max_range: float) -> float:
+    """Steps left out: `surface_step` of a part; any will do in one where there is no surface."""
+    if part is not model and not bool((part.weights > 0).any()):
+        return max_range
+    return surface_step(part)
+
+
+def _raycast(model: Any, rays: _Rays, threshold: float, surface: str) -> Tensor:
+    origins, directions, step, max_range = rays
     level = math.log(threshold / (1 - threshold))
     maybe = _empty_space(model, level + EVIDENCE, step, max_range, len(directions))
     parts = []
@@ -137,7 +154,7 @@ def surface_step(model: Any) -> float:
 
 def unit_rays(model: Any, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """(R, D) origins and (R, D) directions of length 1, float64, on the map's device."""
-    device = model.centers.device
+    device = model.origin.device
     directions = directions.to(device, torch.float64)
     directions = directions / torch.linalg.vector_norm(directions, dim=1, keepdim=True)
     return origins.to(device, torch.float64).expand_as(directions), directions

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.native import nearest_centers
-from lardhm_torch.rays import check_rays, surface_step, unit_rays
+from lardhm_torch.querying import local_parts
+from lardhm_torch.rays import check_rays, ray_step, unit_rays
 
 HAZARD_LENGTH = 0.1  # [m] over which log-odds count once
 SHORTEST = (
@@ -84,8 +85,18 @@ def segment_hazard(
         ValueError: starts and ends are not (S, D) both, or a number is not in its range.
     """
     _check(model, starts, ends, radius, length, step)
-    starts, ends = (x.to(model.centers.device, torch.float64) for x in (starts, ends))
-    step = surface_step(model) / 2 if step is None else step
+    starts, ends = (x.to(model.origin.device, torch.float64) for x in (starts, ends))
+    result = starts.new_zeros(len(starts))
+    boxes = starts.minimum(ends) - radius, starts.maximum(ends) + radius
+    for rows, part in local_parts(model, *boxes):
+        spacing = ray_step(model, part, 1.0) / 2 if step is None else step
+        met = _segment_hazard(part, starts[rows], ends[rows], radius, spacing) / length
+        result = result.index_copy(0, rows, met)
+    return result
+
+
+def _segment_hazard(model: Any, starts: Tensor, ends: Tensor, radius: float, step: float) -> Tensor:
+    """(S,) the largest integral of log-odds above 0 over the ways of a ball's points [m]."""
     offsets = _ball(model.dim, radius).to(starts.device)
     starts = (starts[:, None] + offsets).reshape(-1, model.dim)
     ends = (ends[:, None] + offsets).reshape(-1, model.dim)
@@ -94,7 +105,7 @@ def segment_hazard(
         starts.split(SEGMENTS_AT_ONCE), ends.split(SEGMENTS_AT_ONCE), strict=True
     ):
         pieces = _cut(model, start.detach(), end.detach(), step)
-        parts.append(_integrate(model, start, end, pieces) / length)
+        parts.append(_integrate(model, start, end, pieces))
     return torch.cat(parts).reshape(-1, len(offsets)).amax(dim=1)
 
 
@@ -144,7 +155,17 @@ def expected_range(
     """
     check_rays(model, origins, directions, max_range, step)
     origins, directions = unit_rays(model, origins, directions)
-    step = surface_step(model) if step is None else step
+    result, ends = origins.new_zeros(len(origins)), origins + max_range * directions
+    for rows, part in local_parts(model, origins.minimum(ends), origins.maximum(ends)):
+        spacing = ray_step(model, part, max_range) if step is None else step
+        way = origins[rows], directions[rows], max_range
+        result = result.index_copy(0, rows, _expected_range(part, *way, spacing, length))
+    return result
+
+
+def _expected_range(
+    model: Any, origins: Tensor, directions: Tensor, max_range: float, step: float, length: float
+) -> Tensor:
     count = math.ceil(max_range / step)
     edges = torch.linspace(0, max_range, count + 1, dtype=torch.float64, device=origins.device)
     points = origins[:, None] + edges[:, None] * directions[:, None]  # (R, count + 1, D)

@@ -354,4 +354,5 @@ def _check_model(model: Any) -> None:
 
 def _snapshot(model: Any) -> Any:
     """A copy that training on does not change."""
-    return copy.deepcopy(model).requires_grad_(False)
+    whole = model.merge() if hasattr(model, "merge") else copy.deepcopy(model)
+    return whole.requires_grad_(False)

@@ -17,11 +17,11 @@ def query(arguments: argparse.Namespace) -> None:
     import numpy as np
     import torch
 
-    from lardhm_torch import LardHilbertMap
     from lardhm_torch.files import replaced_file
     from lardhm_torch.io import load_points
+    from lardhm_torch.tiles.tiled_map import open_map
 
-    model = LardHilbertMap.load(arguments.map)
+    model = open_map(arguments.map)
     points = load_points(arguments.points)
     if points.shape[1] == model.dim + 1 and bool((points[:, -1] == points[:1, -1]).all()):
         points = points[:, :-1]  # flat scans, as `fit --dim 2` takes them
@@ -34,11 +34,12 @@ def query(arguments: argparse.Namespace) -> None:
 
 def mesh(arguments: argparse.Namespace) -> None:
     """A map to a surface."""
-    from lardhm_torch import LardHilbertMap, extract_mesh
+    from lardhm_torch import extract_mesh
     from lardhm_torch.mesh_files import save_mesh
+    from lardhm_torch.tiles.tiled_map import open_map
 
     surface = extract_mesh(
-        LardHilbertMap.load(arguments.map),
+        open_map(arguments.map),
         arguments.resolution,
         arguments.threshold,
         color=arguments.color,
@@ -50,10 +51,10 @@ def mesh(arguments: argparse.Namespace) -> None:
 
 def grid(arguments: argparse.Namespace) -> None:
     """A map to a grid of probabilities: .npz, or OctoMap's .bt and .ot."""
-    from lardhm_torch import LardHilbertMap
     from lardhm_torch.exporting import save_grid
+    from lardhm_torch.tiles.tiled_map import open_map
 
-    model = LardHilbertMap.load(arguments.map)
+    model = open_map(arguments.map)
     count = save_grid(model, arguments.output, arguments.resolution)
     print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
@@ -62,10 +63,10 @@ def view(arguments: argparse.Namespace) -> None:
     """A map on a page for the browser, with its scans."""
     import threading
 
-    from lardhm_torch import LardHilbertMap
+    from lardhm_torch.tiles.tiled_map import open_map
     from lardhm_torch.viewer import MapViewer, ViewConfig
 
-    model = LardHilbertMap.load(arguments.map)
+    model = open_map(arguments.map)
     scans = read_scans(arguments, model.dim) if arguments.scans else None
     config = ViewConfig(host=arguments.host, port=arguments.port, resolution=arguments.resolution)
     viewer = MapViewer(model, scans, config)
@@ -84,10 +85,11 @@ def view(arguments: argparse.Namespace) -> None:
 
 def render(arguments: argparse.Namespace) -> None:
     """A map to a picture, without a screen."""
-    from lardhm_torch import LardHilbertMap, extract_mesh
+    from lardhm_torch import extract_mesh
     from lardhm_torch.rendering import render_mesh, render_slice
+    from lardhm_torch.tiles.tiled_map import open_map
 
-    model = LardHilbertMap.load(arguments.map)
+    model = open_map(arguments.map)
     if arguments.slice is not None or model.dim == 2:
         render_slice(model, arguments.output, arguments.slice, arguments.resolution)
         print(f"slice -> {arguments.output}")
@@ -102,10 +104,11 @@ def render(arguments: argparse.Namespace) -> None:
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """A map against held-out rays."""
-    from lardhm_torch import LardHilbertMap, metrics
+    from lardhm_torch import metrics
     from lardhm_torch.calibration import draw_reliability
+    from lardhm_torch.tiles.tiled_map import open_map
 
-    model = LardHilbertMap.load(arguments.map)
+    model = open_map(arguments.map)
     scans = read_scans(arguments, model.dim)
     answers = metrics.answer_held_out(model, scans, seed=arguments.seed)
     table = metrics.score_held_out(answers)
@@ -115,14 +118,23 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def info(arguments: argparse.Namespace) -> None:
-    """What a map file holds."""
+    """What a map file, or the folder of a tiled map, holds."""
+    rows = (_info_of_folder if Path(arguments.map).is_dir() else _info_of_file)(arguments.map)
+    if arguments.json:
+        print(json.dumps(rows, indent=2))
+        return
+    for name, value in rows.items():
+        print(f"{name:<22}{value}")
+
+
+def _info_of_file(path: str) -> dict[str, Any]:
     from lardhm_torch import LardHilbertMap
     from lardhm_torch.querying import map_bounds
 
-    model = LardHilbertMap.load(arguments.map)
+    model = LardHilbertMap.load(path)
     occupied = int(model.is_occupied.sum())
     rows: dict[str, Any] = {
-        "file size [bytes]": Path(arguments.map).stat().st_size,
+        "file size [bytes]": Path(path).stat().st_size,
         **model.settings,
         "dtype": str(model.centers.dtype).removeprefix("torch."),
         "clusters": len(model),
@@ -134,8 +146,29 @@ def info(arguments: argparse.Namespace) -> None:
     if len(model):
         lower, upper = map_bounds(model)
         rows["bounds [m]"] = [[round(float(v), 3) for v in corner] for corner in (lower, upper)]
-    if arguments.json:
-        print(json.dumps(rows, indent=2))
-        return
-    for name, value in rows.items():
-        print(f"{name:<22}{value}")
+    return rows
+
+
+def _info_of_folder(path: str) -> dict[str, Any]:
+    """From the manifest alone: the tiles stay closed."""
+    from lardhm_torch.tiles.manifest import read_manifest
+
+    manifest = read_manifest(path)
+    tiles = list(manifest.tiles.values())
+    rows: dict[str, Any] = {
+        "tiles": len(tiles),
+        "tile edge [m]": manifest.edge,
+        "halo [m]": manifest.halo,
+        **manifest.settings,
+        "dtype": manifest.dtype,
+        "clusters": sum(tile.num_clusters for tile in tiles),
+        "training points": sum(tile.num_points for tile in tiles),
+        "origin [m]": list(manifest.origin),
+    }
+    if tiles:
+        corners = [
+            [pick(axis) for axis in zip(*(tile.bounds[side] for tile in tiles), strict=True)]
+            for side, pick in enumerate((min, max))
+        ]
+        rows["centers [m]"] = [[round(value, 3) for value in corner] for corner in corners]
+    return rows

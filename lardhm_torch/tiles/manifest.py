@@ -239,7 +239,8 @@ def _from_json(body: dict[str, Any]) -> Manifest:
     tiles = {}
     for name, entry in body["tiles"].items():
         try:
-            tiles[tile_index(name)] = _tile_of(entry)
+            index = tile_index(name)
+            tiles[index] = _tile_of(entry)
         except (TypeError, ValueError) as error:
             raise ValueError(f"tile {name!r}: {error}") from error
     return Manifest(**{**body, "origin": _position(body["origin"]), "tiles": tiles})

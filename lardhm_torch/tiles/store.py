@@ -123,41 +123,27 @@ class TileStore:
 
 
 @torch.no_grad()
-def joined(models: list[LardHilbertMap], settings: Any, middle: Tensor) -> LardHilbertMap:
-    """One map of the clusters of all, in their order; tensors keep their values.
+def joined(models: list[LardHilbertMap], settings: Any, origin: Tensor) -> LardHilbertMap:
+    """One map of the clusters of all, in their order, in the frame of ``origin`` (D,) world [m].
 
-    If all have one origin, that stays and so does every bit. Else the new origin is ``middle`` (D,),
-    rounded to whole meters, in which centers lose least.
+    Where that is a map's own frame its tensors keep every bit.
     """
-    origins = torch.stack([model.origin for model in models]) if models else middle[None]
-    same = bool((origins == origins[0]).all())
-    origin = origins[0] if same else middle.to(origins).round()
     result = LardHilbertMap(**settings)
-    if not models:
-        result.origin = origin
-        return result.requires_grad_(False)
-    tensors = {}
-    for name, tensor in models[0].state_dict().items():
-        if not isinstance(tensor, Tensor) or name == "origin":
-            continue
-        parts = [model.state_dict()[name] for model in models]
-        if name in ("centers", "means") and not same:
-            parts = [
-                (part.double() + (model.origin - origin)).to(part.dtype)
-                for part, model in zip(parts, models, strict=True)
-            ]
-        tensors[name] = torch.cat(parts)
-    result = result.to(models[0].centers)
-    result.load_state_dict({**tensors, "origin": origin, "_extra_state": result.get_extra_state()})
+    if models:
+        states = [_in_frame(model, origin) for model in models]
+        tensors = {name: torch.cat([state[name] for state in states]) for name in states[0]}
+        result = result.to(models[0].centers)
+        extra = result.get_extra_state()
+        result.load_state_dict({**tensors, "origin": origin, "_extra_state": extra})
+    result.origin = origin.clone()
     return result.requires_grad_(False)
 
 
-def rows_of(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
-    """A map of some clusters of another, in its frame."""
-    result = LardHilbertMap(**model.settings).to(model.centers)
-    tensors = {
-        name: tensor if not isinstance(tensor, Tensor) or name == "origin" else tensor[rows]
-        for name, tensor in model.state_dict().items()
-    }
-    result.load_state_dict(tensors)
-    return result
+def _in_frame(model: LardHilbertMap, origin: Tensor) -> dict[str, Tensor]:
+    """All (M, ...) tensors of a map, positions relative to another origin."""
+    tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+    own = tensors.pop("origin")
+    if not torch.equal(own, origin):
+        for name in ("centers", "means"):
+            tensors[name] = (tensors[name].double() + (own - origin)).to(tensors[name].dtype)
+    return tensors

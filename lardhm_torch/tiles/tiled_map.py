@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -13,33 +12,21 @@ from torch import Tensor
 
 from lardhm_torch import uncertainty
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number, shifted
 from lardhm_torch.tiles.layout import (
     block_box,
     layout_of,
     needed_tiles,
     speaking_blocks,
 )
-from lardhm_torch.tiles.manifest import (
-    MANIFEST_NAME,
-    Manifest,
-    read_manifest,
-    tile_indices,
-    tile_path,
-    tile_record,
-    write_manifest,
-)
-from lardhm_torch.tiles.store import (
-    Cache,
-    DamagedTileError,
-    TileStore,
-    cluster_bytes,
-    joined,
-    rows_of,
-)
+from lardhm_torch.tiles.manifest import Manifest, read_manifest, tile_indices
+from lardhm_torch.tiles.splitting import split_map
+from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore, cluster_bytes, joined
 
 MEMORY_LIMIT = 1 << 30  # bytes of clusters held at a time
-WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts", "origin")
+WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts")
 POINTS_AT_ONCE = 1 << 22  # points sorted by block at a time
+NUMBERS_AT_ONCE = 1 << 18  # points whose blocks are looked up at a time
 
 
 class TiledMap:
@@ -73,7 +60,9 @@ class TiledMap:
         self.memory_limit = int(memory_limit)
         self.dim = manifest.dim
         self.num_neighbors = int(manifest.settings["num_neighbors"])
+        self.covariance_scale = float(manifest.settings["covariance_scale"])
         self.settings = dict(manifest.settings)
+        self.origin = torch.tensor(manifest.origin, dtype=torch.float64, device=device)
         self._store = TileStore(folder, manifest, skip_damaged=skip_damaged, device=device)
         self._layout = layout_of(manifest)
         self._blocks = speaking_blocks(self._layout)
@@ -122,26 +111,7 @@ class TiledMap:
             ValueError: the map is empty, or edge is not > 0.
             FileExistsError: the folder holds a tiled map already.
         """
-        folder = Path(folder)
-        if len(model) == 0:
-            raise ValueError("the map must hold clusters to be split; it is empty: fit it first")
-        if (folder / MANIFEST_NAME).exists():
-            raise FileExistsError(f"{folder} must be a new folder; it holds a tiled map already")
-        manifest = Manifest(
-            edge=float(edge),
-            origin=tuple(model.origin.tolist()),
-            settings=model.settings,
-            dtype=str(model.centers.dtype).removeprefix("torch."),
-        )
-        tile_path(folder, (0,)).parent.mkdir(parents=True, exist_ok=True)
-        owners = tile_indices(model.centers.detach(), [0.0] * model.dim, edge)
-        tiles = {}
-        for place in owners.unique(dim=0):
-            rows = (owners == place).all(dim=1).nonzero().squeeze(1)
-            tile, path = rows_of(model, rows), tile_path(folder, tuple(place.tolist()))
-            tile.save(path)
-            tiles[tuple(place.tolist())] = tile_record(tile, path, int(tile.counts.sum()))
-        write_manifest(folder, Manifest(**{**vars(manifest), "tiles": tiles}))
+        split_map(model, folder, edge)
         return TiledMap.open(folder)
 
     # --- what the map is ---
@@ -193,7 +163,7 @@ class TiledMap:
             raise ValueError("axes must be finite; got NaN or infinity")
         shape, silent = [len(axis) for axis in axes], 0.5 if probability else 0.0
         result = torch.full(shape, silent, dtype=self._store.dtype, device=self._store.device)
-        for place in self._lattice_parts(axes):
+        for place in lattice_parts(axes, self._layout.origin, self._layout.block_edge):
             part = [axis[rows] for axis, rows in zip(axes, place, strict=True)]
             corner = torch.stack([axis[0].double().cpu() for axis in part])
             number = int(self._number(corner[None])[0])
@@ -202,6 +172,10 @@ class TiledMap:
                 model = self._block(number, ends[:, 0], ends[:, 1])
                 result[place] = model.query_lattice(part, probability=probability)
         return result
+
+    def pieces(self) -> Iterator[LardHilbertMap]:
+        """The tiles' own maps, one after the other."""
+        return (self._tile(row) for row in range(len(self._layout.indices)))
 
     def merge(self, bounds: tuple[Any, Any] | None = None) -> LardHilbertMap:
         """An ordinary map that answers within ``bounds`` as this one does, in memory as a whole.
@@ -214,20 +188,16 @@ class TiledMap:
             ValueError: bounds are not two corners, lower <= upper.
         """
         if bounds is None:
-            rows = torch.arange(len(self._layout.indices))
-        else:
-            lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
-            if (
-                lower.shape != (self.dim,)
-                or lower.shape != upper.shape
-                or not (lower <= upper).all()
-            ):
-                raise ValueError(
-                    f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
-                    f"got {lower.tolist()} and {upper.tolist()}"
-                )
-            rows = needed_tiles(self._layout, lower, upper)
-        return self._joined(rows, [self._tile(row) for row in rows.tolist()])
+            return self._joined(list(self.pieces()), self.origin)
+        lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
+        good = lower.shape == upper.shape == (self.dim,)
+        if not good or not bool((lower <= upper).all()):
+            raise ValueError(
+                f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
+                f"got {lower.tolist()} and {upper.tolist()}"
+            )
+        rows = needed_tiles(self._layout, lower, upper).tolist()
+        return self._joined([self._tile(row) for row in rows])
 
     @torch.no_grad()
     def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
@@ -242,8 +212,7 @@ class TiledMap:
         _, owner, counts = index.unique(dim=0, return_inverse=True, return_counts=True)
         for rows in owner.argsort(stable=True).split(counts.tolist()):
             box = lower[rows].amin(dim=0), upper[rows].amax(dim=0)
-            self._check_fits(needed_tiles(self._layout, *box), "a part of the map")
-            yield rows, self.merge(box)
+            yield rows.to(self.origin.device), self._part(*box)
 
     # --- how ---
 
@@ -268,7 +237,7 @@ class TiledMap:
             if len(model) == 0:
                 continue
             if keeps_graph:
-                where.append(_positions(rows, flat.device))
+                where.append(row_numbers(rows, flat.device))
                 answers.append(answer(model, part))
             else:
                 result[rows] = answer(model, part)
@@ -283,27 +252,15 @@ class TiledMap:
     def _rows_by_block(self, flat: Tensor, result: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
         """Number of a block and rows of its points, for all points that any tile has a say in.
 
-        Points that are not finite get NaN in the result. Runs of points of one block stay runs.
+        Points that are not finite get NaN in the result.
         """
         for start in range(0, len(flat), POINTS_AT_ONCE):
             part = flat[start : start + POINTS_AT_ONCE]
-            numbers = self._number(part)
+            numbers = torch.cat([self._number(some) for some in part.split(NUMBERS_AT_ONCE)])
             bad = ~part.isfinite().all(dim=1)
             result[start : start + len(part)][bad] = torch.nan
-            numbers[bad] = -1
-            values, lengths = numbers.unique_consecutive(return_counts=True)
-            begins = lengths.cumsum(0) - lengths
-            order = values.argsort(stable=True)
-            sizes = values.unique(return_counts=True)[1]
-            for runs in order.split(sizes.tolist()):
-                number = int(values[runs[0]])
-                if number < 0:
-                    continue
-                if len(runs) == 1:
-                    first = start + int(begins[runs[0]])
-                    yield number, slice(first, first + int(lengths[runs[0]]))
-                else:
-                    yield number, start + _spread(begins[runs], lengths[runs])
+            for number, rows in rows_by_number(numbers.masked_fill_(bad, -1)):
+                yield number, shifted(rows, start)
 
     def _number(self, points: Tensor) -> Tensor:
         """(N, D) world positions -> (N,) int32 number of the block of each, -1 where none speaks."""
@@ -316,14 +273,14 @@ class TiledMap:
         if model is None:
             box = block_box(self._layout, self._block_indices[number])
             rows = needed_tiles(self._layout, *box)
-            self._check_fits(rows, "a block of the map")
+            self._make_room(rows, "a block of the map")
             tiles, missing = [], {}
             for row in rows.tolist():
                 try:
                     tiles.append(self._tile(row))
                 except DamagedTileError as error:
                     missing[row] = error
-            model = self._joined(rows, tiles)
+            model = self._joined(tiles)
             self._cache.put(number, model)
             self._missing[number] = missing
         if self._missing[number]:
@@ -331,6 +288,17 @@ class TiledMap:
                 if row in self._missing[number]:
                     raise self._missing[number][row]
         return model
+
+    def _part(self, lower: Tensor, upper: Tensor) -> LardHilbertMap:
+        """The map of a block, if the box (D,) to (D,) lies in one, or a map made for the box."""
+        first, last = self._number(torch.stack([lower, upper])).tolist()
+        index = tile_indices(
+            torch.stack([lower, upper]), self._layout.origin, self._layout.block_edge
+        )
+        if first >= 0 and first == last and bool((index[0] == index[1]).all()):
+            return self._block(first, lower, upper)
+        self._make_room(needed_tiles(self._layout, lower, upper), "a part of the map")
+        return self.merge((lower, upper))
 
     def _tile(self, row: int) -> LardHilbertMap:
         index = self._layout.indices[row]
@@ -340,60 +308,42 @@ class TiledMap:
             self._cache.put(index, model)
         return model
 
-    def _joined(self, rows: Tensor, tiles: list[LardHilbertMap]) -> LardHilbertMap:
-        if len(rows) == 0:
-            middle = self._layout.origin
-        else:
-            lower, upper = (
-                self._layout.lower[rows].amin(dim=0),
-                self._layout.upper[rows].amax(dim=0),
-            )
-            middle = (lower + upper) / 2
-        model = joined(tiles, self.settings, middle)
+    def _joined(self, tiles: list[LardHilbertMap], origin: Tensor | None = None) -> LardHilbertMap:
+        """One map of tiles; in their own frame if they share one, else in one amid their origins."""
+        if origin is None and tiles:
+            origins = torch.stack([tile.origin for tile in tiles])
+            same = bool((origins == origins[0]).all())
+            middle = (origins.amin(dim=0) + origins.amax(dim=0)) / 2
+            origin = origins[0] if same else middle.round()
+        model = joined(tiles, self.settings, self.origin if origin is None else origin)
         return model.to(self._store.device, self._store.dtype)
 
-    def _check_fits(self, rows: Tensor, what: str) -> None:
-        needed = int(self._layout.counts[rows].sum()) * cluster_bytes(self.dim, self._store.dtype)
+    def _make_room(self, rows: Tensor, what: str) -> None:
+        """Forget what is unused longest, so that these tiles fit the limit."""
+        clusters = 2 * int(self._layout.counts[rows].sum())  # of the tiles and of what they make
+        needed = clusters * cluster_bytes(self.dim, self._store.dtype)
         if needed > self.memory_limit:
             raise ValueError(
                 f"memory_limit must be {needed} bytes or more to hold {what}; "
                 f"got {self.memory_limit}"
             )
+        self._cache.make_room(needed)
 
     def _whole(self) -> LardHilbertMap:
         model = self._cache.get("whole")
         if model is None:
             rows = torch.arange(len(self._layout.indices))
-            self._check_fits(rows, "all clusters, which are asked for")
+            self._make_room(rows, "all clusters, which are asked for")
             model = self.merge()
             self._cache.put("whole", model)
         return model
 
-    def _lattice_parts(self, axes: Sequence[Tensor]) -> Iterator[tuple[slice, ...]]:
-        """Sub-lattices of a lattice that lie in one block each."""
-        runs = []
-        for axis, start in zip(axes, self._layout.origin.tolist(), strict=True):
-            index = ((axis.double() - start) / self._layout.block_edge).floor()
-            lengths = index.unique_consecutive(return_counts=True)[1].tolist()
-            ends = torch.tensor([0, *lengths]).cumsum(0).tolist()
-            runs.append([slice(a, b) for a, b in zip(ends, ends[1:], strict=False)])
-        for number in range(math.prod(len(r) for r in runs)):
-            place = []
-            for options in reversed(runs):
-                number, which = divmod(number, len(options))
-                place.append(options[which])
-            yield tuple(reversed(place))
 
+def open_map(path: str | os.PathLike[str]) -> LardHilbertMap | TiledMap:
+    """The map of a file, or the tiled map of a folder.
 
-def _positions(rows: slice | Tensor, device: torch.device) -> Tensor:
-    if isinstance(rows, slice):
-        return torch.arange(rows.start, rows.stop, device=device)
-    return rows
-
-
-def _spread(begins: Tensor, lengths: Tensor) -> Tensor:
-    """Begins and lengths (R,) of runs -> all positions in them."""
-    owner = torch.repeat_interleave(lengths)
-    ends = lengths.cumsum(0)
-    within = torch.arange(len(owner), device=owner.device) - (ends - lengths)[owner]
-    return begins[owner] + within
+    Raises:
+        FileNotFoundError: there is no such file, or the folder holds no manifest.
+        ValueError: the file or the manifest is damaged.
+    """
+    return TiledMap.open(path) if Path(path).is_dir() else LardHilbertMap.load(path)

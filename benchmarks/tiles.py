@@ -1,0 +1,148 @@
+"""Questions to a map of many tiles: rate and memory against one map in memory.
+
+    python benchmarks/tiles.py            # a map of 1000 tiles, 10^7 points
+
+Each setting runs in a process of its own, whose largest resident set is reported. The tiled map is
+asked cold (tiles are read from disk, checked and joined on the way) and again with what it holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+from conditions import conditions
+
+from lardhm_torch import LardHilbertMap, TiledMap
+from lardhm_torch.features import raw_factors
+from lardhm_torch.map_state import MapState, assign_state
+
+EDGE = 20.0  # [m] of a tile
+SIDE = (32, 32)  # tiles of ground, the first 1000 of them
+CLUSTERS = 1000  # a tile: 20 m of KITTI street take about 800
+
+
+def city(num_tiles: int, seed: int = 0) -> LardHilbertMap:
+    """A flat world of tiles, clusters as large and as dense as those of a street, 4 m high."""
+    rng = torch.Generator().manual_seed(seed)
+    count = num_tiles * CLUSTERS
+    tile = torch.arange(count) // CLUSTERS
+    corner = torch.stack([tile // SIDE[1], tile % SIDE[1], torch.zeros_like(tile)], dim=1) * EDGE
+    size = torch.tensor([EDGE, EDGE, 4.0])
+    centers = corner + size * torch.rand(count, 3, generator=rng)
+    factors = torch.diag_embed(0.05 + 0.4 * torch.rand(count, 3, generator=rng))
+    weights = 4 * torch.randn(count, generator=rng)
+    counts = torch.full((count,), 100)
+    model = LardHilbertMap()
+    state = (
+        weights,
+        centers,
+        raw_factors(factors),
+        weights > 0,
+        counts,
+        centers,
+        factors @ factors.mT,
+    )
+    assign_state(model, MapState(*state))
+    return model.requires_grad_(False)
+
+
+def questions(num_points: int, num_tiles: int, order: str, seed: int = 1) -> torch.Tensor:
+    """(N, 3) float32 points spread over all tiles, 4 m high; grouped by tile, or in random order."""
+    rng = torch.Generator().manual_seed(seed)
+    tile = torch.arange(num_points) * num_tiles // num_points
+    points = torch.rand(num_points, 3, generator=rng)
+    points[:, 0].add_(tile // SIDE[1]).mul_(EDGE)
+    points[:, 1].add_(tile % SIDE[1]).mul_(EDGE)
+    points[:, 2].mul_(4.0)
+    del tile
+    return points if order == "grouped" else points[torch.randperm(num_points, generator=rng)]
+
+
+def peak_megabytes() -> float:
+    """Largest resident set of this process so far (not of the one that started it)."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
+def seconds(ask: object, points: torch.Tensor) -> tuple[float, torch.Tensor]:
+    start = time.perf_counter()
+    with torch.no_grad():
+        answer = ask(points)  # type: ignore[operator]
+    return time.perf_counter() - start, answer
+
+
+def measure(arguments: argparse.Namespace) -> None:
+    """One setting: seconds and memory as JSON."""
+    points = questions(arguments.points, arguments.tiles, arguments.order)
+    folder, row = Path(arguments.folder), {"points_mb": points.nbytes / 2**20}
+    start = time.perf_counter()
+    if arguments.measure == "single":
+        model = LardHilbertMap.load(folder / "map.pt").requires_grad_(False)
+        model(points[:1])
+    else:
+        model = TiledMap.open(folder / "tiles", memory_limit=arguments.limit << 20)
+    row["open_s"] = time.perf_counter() - start
+    row["before_mb"] = peak_megabytes()
+    row["first_s"], answer = seconds(model, points)
+    row["again_s"] = min(seconds(model, points)[0] for _ in range(arguments.repeats))
+    row["peak_mb"] = peak_megabytes()
+    some = torch.arange(0, len(points), max(1, len(points) // 10_000))
+    torch.save(answer[some], folder / f"{arguments.measure}.answers")
+    print(json.dumps(row))
+
+
+def main() -> None:
+    """Make the map once, then measure each setting in turn."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tiles", type=int, default=1000)
+    parser.add_argument("--points", type=int, default=10_000_000)
+    parser.add_argument("--limit", type=int, default=512, help="memory limit of the map [MiB]")
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--folder", help="where the map is, or will be, kept")
+    parser.add_argument("--orders", nargs="*", default=("grouped", "random"))
+    parser.add_argument("--order", choices=("grouped", "random"), default="grouped")
+    parser.add_argument("--measure", choices=("single", "tiled"))
+    arguments = parser.parse_args()
+    if arguments.measure:
+        measure(arguments)
+        return
+    print(conditions())
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(arguments.folder or scratch)
+        if not (folder / "tiles").exists():
+            folder.mkdir(exist_ok=True)
+            model = city(arguments.tiles)
+            model.save(folder / "map.pt")
+            TiledMap.split(model, folder / "tiles", EDGE)
+        for order in arguments.orders:
+            rows = {}
+            for name in ("single", "tiled"):
+                words = [
+                    *sys.argv[1:],
+                    "--folder",
+                    str(folder),
+                    "--measure",
+                    name,
+                    "--order",
+                    order,
+                ]
+                done = subprocess.run(
+                    [sys.executable, __file__, *words], check=True, capture_output=True, text=True
+                )
+                rows[name] = json.loads(done.stdout)
+                print(order, name, {key: round(value, 2) for key, value in rows[name].items()})
+            ours, theirs = (torch.load(folder / f"{name}.answers") for name in ("tiled", "single"))
+            for key in ("first_s", "again_s"):
+                print(f"{order}: {key} {rows['tiled'][key] / rows['single'][key]:.2f} times")
+            print(f"{order}: answers differ by at most {float((ours - theirs).abs().max()):.1e}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+import numpy as np
+import pytest
+import torch
+from small_maps import wall_map
+from tiled_maps import EDGE, F64, border_points, random_map, tiled
+
+from lardhm_torch import LardHilbertMap, TiledMap, extract_mesh, raycast, sample_rays
+from lardhm_torch.exploring import frontiers
+from lardhm_torch.io import load_scans
+from lardhm_torch.querying import map_bounds, occupancy_gradient, query_grid
+from lardhm_torch.rays import surface_step
+from lardhm_torch.scans import split_rays
+from lardhm_torch.segments import expected_range, segment_hazard
+from lardhm_torch.tiles import layout
+from lardhm_torch.tiles.layout import layout_of, needed_tiles
+from lardhm_torch.tiles.manifest import tile_indices
+from lardhm_torch.tiles.store import cluster_bytes
+
+TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
+both = pytest.mark.parametrize("dtype", [torch.float32, F64])
+
+
+def assert_answers_alike(tiles, single, points, gradient_scale=1.0):
+    """Probabilities, log-odds and gradients of the probability."""
+    tolerance = TOLERANCES[single.centers.dtype]
+    for ask in ("forward", "log_odds"):
+        ours = tiles(points) if ask == "forward" else tiles.log_odds(points)
+        theirs = getattr(single, ask)(points)
+        assert ours.dtype == theirs.dtype
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=tolerance)
+    steep = [p.clone().requires_grad_() for p in (points, points)]
+    ours = torch.autograd.grad(tiles(steep[0]).sum(), steep[0])[0]
+    theirs = torch.autograd.grad(single(steep[1]).sum(), steep[1])[0]
+    assert theirs.abs().max() > 0.1
+    torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance * gradient_scale)
+
+
+@both
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("block_clusters", [1, 64])
+def test_answers_at_borders_are_those_of_the_merged_map(
+    dtype, dim, block_clusters, tmp_path, monkeypatch
+):
+    tiles = tiled(random_map(1, dim, dtype), tmp_path, monkeypatch, block_clusters)
+    assert len(tiles.manifest.tiles) > 10
+    assert tiles._layout.block_tiles < 4
+    assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 10_000))
+
+
+@pytest.mark.parametrize("name", ["kitti00_mulls", "balm_realworld"])
+def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
+    name, data, tmp_path, monkeypatch
+):
+    scans, _ = split_rays(load_scans(data / name), 0.05, seed=0)
+    samples = sample_rays(scans, seed=0)
+    model = LardHilbertMap().fit(samples.points, samples.labels)
+    monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 500)
+    for dtype in (torch.float32, F64):
+        tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 10.0)
+        assert tiles._layout.block_tiles < 4
+        assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 100_000))
+
+
+def test_a_map_split_and_merged_is_the_same_map(tmp_path, monkeypatch):
+    model = random_map(dtype=torch.float32)
+    tiles = tiled(model, tmp_path, monkeypatch)
+    merged = tiles.merge()
+    order = [torch.argsort(m.centers[:, 0]) for m in (model, merged)]
+    for name, tensor in model.state_dict().items():
+        if isinstance(tensor, torch.Tensor) and name != "origin":
+            assert torch.equal(tensor[order[0]], merged.state_dict()[name][order[1]]), name
+    assert torch.equal(merged.origin, model.origin)
+    assert len(tiles) == len(model)
+    assert map_bounds(tiles)[0].tolist() == pytest.approx(map_bounds(model)[0].tolist())
+
+
+def test_a_part_answers_inside_its_bounds_like_the_whole(tmp_path, monkeypatch):
+    tiles = tiled(random_map(2), tmp_path, monkeypatch)
+    lower, upper = torch.tensor([103.0, 104, 105]).double(), torch.tensor([106.0, 108, 107])
+    part, whole = tiles.merge((lower, upper)), tiles.merge()
+    assert len(part) < len(whole)
+    points = lower + (upper - lower) * torch.rand(2000, 3).double()
+    torch.testing.assert_close(part.log_odds(points), whole.log_odds(points), rtol=0, atol=1e-8)
+    torch.testing.assert_close(
+        occupancy_gradient(part, points), occupancy_gradient(whole, points), rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_neighbor_that_speaks_is_in_a_needed_tile(seed, tmp_path, monkeypatch):
+    tiles = tiled(random_map(seed), tmp_path, monkeypatch)
+    plan, model = layout_of(tiles.manifest), tiles.merge()
+    points = border_points(tiles, 100, seed)
+    indices, values = model._nearest_features(model._to_map_frame(points))
+    speaks = (values * model.weights[indices]).abs() > 1e-9
+    owners = tile_indices(model.centers, [0.0] * 3, EDGE)
+    for point, near, spoken in zip(points, indices, speaks, strict=True):
+        needed = {plan.indices[row] for row in needed_tiles(plan, point, point).tolist()}
+        assert {tuple(owners[row].tolist()) for row in near[spoken]} <= needed
+
+
+def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, monkeypatch):
+    model = random_map(3, clusters=4000)
+    with torch.no_grad():
+        model.raw_scale_tril[0].diagonal().fill_(3.0)  # 20 m, in a map of 20 m
+    tiles = tiled(model, tmp_path, monkeypatch)
+    point = torch.full((3,), 110.0, dtype=F64)
+    assert tiles._layout.reach.max() > 100
+    assert len(needed_tiles(tiles._layout, point, point)) < len(tiles.manifest.tiles) / 2
+    torch.testing.assert_close(tiles.log_odds(point), tiles.merge().log_odds(point))
+
+
+def test_points_may_have_any_leading_shape_and_order(tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    points = border_points(tiles, 600)
+    expected = tiles(points)
+    order = torch.randperm(600)
+    assert torch.equal(tiles(points[order]), expected[order])
+    assert torch.equal(tiles(points.reshape(5, 6, 20, 3)), expected.reshape(5, 6, 20))
+    assert torch.equal(tiles(points[7]), expected[7])
+    assert tiles(points[:0]).shape == (0,)
+    grouped = points[tile_indices(points, tiles.origin, EDGE)[:, 0].argsort()]
+    torch.testing.assert_close(tiles(grouped), tiles.merge()(grouped))
+
+
+def test_points_in_no_tile_hear_the_clusters_next_door(tmp_path, monkeypatch):
+    model = random_map(clusters=300)
+    with torch.no_grad():
+        model.weights.abs_()
+    tiles = tiled(model, tmp_path, monkeypatch)
+    corner = map_bounds(model)[0]
+    near = (model.centers + model.origin)[model.centers[:, 0].argmin()].detach().clone()
+    near[0] = tiles.manifest.origin[0] - 0.05  # the tiles begin at the origin
+    index = tuple(tile_indices(near, tiles.origin, EDGE).tolist())
+    assert index not in tiles.manifest.tiles
+    assert tiles.log_odds(near) > 0.1
+    torch.testing.assert_close(tiles.log_odds(near), tiles.merge().log_odds(near))
+    torch.testing.assert_close(tiles.log_odds(corner), tiles.merge().log_odds(corner))
+
+
+def test_far_from_everything_the_probability_is_a_half_and_nothing_is_read(tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    for path in (tmp_path / "tiles" / "tiles").iterdir():
+        path.unlink()
+    far = torch.tensor([[1e4, 0, 0], [-1e12, 1, 1], [1e300, 0, 0]], dtype=F64).requires_grad_()
+    assert tiles(far).tolist() == [0.5] * 3
+    assert torch.autograd.grad(tiles(far).sum(), far)[0].abs().max() == 0
+    axes = [torch.tensor([1e4, 2e4]).double()] * 3
+    assert (tiles.query_lattice(axes) == 0.5).all()
+
+
+def test_points_that_are_not_finite_have_no_probability(tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    points = torch.tensor([[torch.nan, 0, 0], [0, torch.inf, 0], [105, 105, 105]])
+    assert tiles(points).isnan().tolist() == [True, True, False]
+
+
+def test_a_lattice_is_answered_like_its_points(tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    lower, upper = [99.0, 103, 103], [112.0, 106, 109]
+    found = query_grid(tiles, lower, upper, 0.25)
+    torch.testing.assert_close(found, query_grid(tiles.merge(), lower, upper, 0.25))
+    assert ((found - 0.5).abs() > 0.1).any()
+
+
+@both
+def test_a_mesh_has_no_seam(dtype, tmp_path, monkeypatch):
+    """A blob around the corner where eight tiles meet, of clusters in all of them."""
+    model = random_map(clusters=8).to(dtype)
+    with torch.no_grad():
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+        model.centers.copy_(EDGE + 0.2 * signs + 0.1 * torch.rand(8, 3))
+        model.raw_scale_tril.copy_(torch.diag_embed(torch.full((8, 3), np.log(0.2))))
+        model.weights.fill_(3.0)
+    tiles = tiled(model, tmp_path, monkeypatch, block_clusters=1)
+    assert len(tiles.manifest.tiles) == 8
+    single, ours = (extract_mesh(m, 0.04, 0.7, evidence=None) for m in (tiles.merge(), tiles))
+    assert single.is_watertight
+    assert ours.is_watertight
+    assert len(ours.split()) == 1
+    assert np.array_equal(single.faces, ours.faces)
+    assert np.abs(single.vertices - ours.vertices).max() < 1e-6 + 1e-4 * (dtype == torch.float32)
+    assert (single.visual.vertex_colors == ours.visual.vertex_colors).all()
+
+
+@pytest.mark.parametrize("color", ["height", "cluster", "probability"])
+def test_a_mesh_across_many_blocks_is_that_of_the_merged_map(color, tmp_path, monkeypatch):
+    model = wall_map()
+    monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 1)
+    tiles = TiledMap.split(model, tmp_path / "tiles", 0.7)
+    single, ours = (extract_mesh(m, 0.06, color=color) for m in (tiles.merge(), tiles))
+    assert len(single.faces) > 500
+    assert np.array_equal(single.faces, ours.faces)
+    np.testing.assert_allclose(single.vertices, ours.vertices, atol=1e-6)
+    assert (single.visual.vertex_colors == ours.visual.vertex_colors).all()
+
+
+def test_rays_end_where_they_do_in_the_merged_map(tmp_path, monkeypatch):
+    tiles = tiled(random_map(clusters=1000), tmp_path, monkeypatch)
+    single = tiles.merge()
+    rng = torch.Generator().manual_seed(0)
+    origins = 100 + 20 * torch.rand(100, 3, generator=rng, dtype=F64)
+    directions = torch.randn(100, 3, generator=rng, dtype=F64)
+    step = surface_step(single)
+    for surface in ("peak", "crossing"):
+        options = {"max_range": 8.0, "step": step, "surface": surface}
+        expected = raycast(single, origins, directions, **options)
+        assert 10 < expected.isfinite().sum() < 100
+        torch.testing.assert_close(raycast(tiles, origins, directions, **options), expected)
+    assert raycast(tiles, origins + 1e5, directions, 5.0).isinf().all()
+    unknown_stops = {"max_range": 5.0, "threshold": 0.1, "surface": "crossing"}
+    assert raycast(tiles, origins + 1e5, directions, **unknown_stops).max() == 0
+
+
+def test_segments_and_frontiers_are_those_of_the_merged_map(tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    single = tiles.merge()
+    rng = torch.Generator().manual_seed(0)
+    starts, ends = 100 + 20 * torch.rand(2, 20, 3, generator=rng, dtype=F64)
+    starts.requires_grad_()
+    met = [segment_hazard(m, starts, ends, step=0.1) for m in (tiles, single)]
+    assert met[1].max() > 0
+    torch.testing.assert_close(*met)
+    torch.testing.assert_close(*(torch.autograd.grad(m.sum(), starts)[0] for m in met))
+    far = [expected_range(m, starts.detach(), ends - 110, 4.0, step=0.2) for m in (tiles, single)]
+    torch.testing.assert_close(*far)
+    found = [frontiers(m, [102] * 3, [107] * 3, 0.25) for m in (tiles, single)]
+    assert torch.equal(found[0].points, found[1].points)
+
+
+def test_variances_are_those_of_the_merged_map(tmp_path, monkeypatch):
+    model = random_map()
+    points = border_points(tiled(model, tmp_path, monkeypatch), 1000)
+    model.fit_uncertainty(points, (model(points) > 0.5).float())
+    tiles = tiled(model, tmp_path / "sure", monkeypatch)
+    for ask in ("variance", "bayesian_probability"):
+        torch.testing.assert_close(getattr(tiles, ask)(points), getattr(model, ask)(points))
+    far = torch.full((3,), 1e4)
+    torch.testing.assert_close(tiles.variance(far), model.variance(far))
+
+
+def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
+    model = random_map(clusters=3000)
+    tiled(model, tmp_path, monkeypatch)
+    limit = 5000 * cluster_bytes(3, F64)
+    tiles = TiledMap.open(tmp_path / "tiles", memory_limit=limit)
+    points = border_points(tiled(model, tmp_path / "again", monkeypatch), 1500)
+    expected = model(points)
+    for some in points.split(300):
+        tiles(some)
+        held = sum(m.centers.numel() for m, _ in tiles._cache._entries.values()) // 3
+        assert held * cluster_bytes(3, F64) == tiles._cache.num_bytes
+        assert held <= 5000
+    torch.testing.assert_close(tiles(points), expected)
+
+
+def test_a_cluster_takes_no_more_memory_than_is_counted(ops):
+    model = random_map(clusters=5000, dtype=torch.float32)
+    model(torch.zeros(1, 3))
+    tensors = [*model.parameters(), *model.buffers(), model._index]
+    assert sum(t.nbytes for t in tensors) <= len(model) * cluster_bytes(3, torch.float32)
+
+
+def test_a_limit_too_small_for_a_block_is_an_error(tmp_path, monkeypatch):
+    tiled(random_map(), tmp_path, monkeypatch)
+    tiles = TiledMap.open(tmp_path / "tiles", memory_limit=1000)
+    with pytest.raises(ValueError, match=r"memory_limit must be \d+ bytes or more to hold a block"):
+        tiles(torch.full((1, 3), 105.0))
+    with pytest.raises(ValueError, match="to hold all clusters, which are asked for; got 1000"):
+        _ = tiles.centers
+    with pytest.raises(ValueError, match="memory_limit must be > 0 bytes; got 0"):
+        TiledMap.open(tmp_path / "tiles", memory_limit=0)
+
+
+def test_bad_arguments_are_named(tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    with pytest.raises(ValueError, match=r"points must be \(..., 3\).*got \(4, 2\)"):
+        tiles(torch.zeros(4, 2))
+    with pytest.raises(ValueError, match="bounds must be two corners of 3 coordinates"):
+        tiles.merge(([0, 0], [1, 1]))
+    with pytest.raises(ValueError, match="axes must be 3 lists"):
+        tiles.query_lattice([torch.zeros(1)] * 2)
+    with pytest.raises(FileExistsError, match="it holds a tiled map already"):
+        TiledMap.split(random_map(), tmp_path / "tiles", EDGE)
+    with pytest.raises(ValueError, match="it is empty: fit it first"):
+        TiledMap.split(LardHilbertMap(), tmp_path / "new", EDGE)
+    with pytest.raises(ValueError, match="edge must be > 0 m; got 0"):
+        TiledMap.split(random_map(), tmp_path / "new", 0.0)
+    with pytest.raises(AttributeError, match="no attribute 'fit'"):
+        tiles.fit()

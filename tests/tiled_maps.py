@@ -1,0 +1,57 @@
+"""Random maps, and the same in tiles, for the tests of tiled maps."""
+
+import torch
+
+from lardhm_torch import LardHilbertMap, TiledMap
+from lardhm_torch.features import raw_factors
+from lardhm_torch.map_state import MapState, assign_state
+from lardhm_torch.tiles import layout
+
+F64 = torch.float64
+EDGE = 4.0
+
+
+def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
+    """A map of an uneven world: most clusters small and in one half, some of empty space large."""
+    rng = torch.Generator().manual_seed(seed)
+    centers = extent * torch.rand(clusters, dim, generator=rng, dtype=F64)
+    centers[::2, 0] /= 4
+    factors = 0.1 * torch.randn(clusters, dim, dim, generator=rng, dtype=F64).tril(-1)
+    sizes = 0.05 + 0.3 * torch.rand(clusters, dim, generator=rng, dtype=F64)
+    sizes[::20] *= 4
+    factors += torch.diag_embed(sizes)
+    weights = 4 * torch.randn(clusters, generator=rng, dtype=F64)
+    counts = torch.randint(1, 50, (clusters,), generator=rng)
+    scatters = counts[:, None, None] * factors @ factors.mT
+    model = LardHilbertMap(dim, num_neighbors=6).to(dtype)
+    state = (weights, centers, raw_factors(factors), weights > 0, counts, centers, scatters)
+    assign_state(model, MapState(*state))
+    model.origin = torch.full((dim,), 100.0, dtype=F64)
+    return model
+
+
+def tiled(model, folder, monkeypatch, block_clusters=64):
+    """The map in tiles, answered in blocks of few clusters, so that there are many."""
+    monkeypatch.setattr(layout, "BLOCK_CLUSTERS", block_clusters)
+    return TiledMap.split(model, folder / "tiles", EDGE)
+
+
+def border_points(tiles, count, seed=0, within=0.5):
+    """World positions near clusters and elsewhere, one coordinate within so much of a border [m]."""
+    rng = torch.Generator().manual_seed(seed)
+    edge, origin = tiles.manifest.edge, torch.tensor(tiles.manifest.origin, dtype=F64)
+    lower, upper = (
+        torch.tensor([t.bounds[i] for t in tiles.manifest.tiles.values()], dtype=F64)
+        for i in (0, 1)
+    )
+    lower, upper = lower.amin(dim=0) - 1, upper.amax(dim=0) + 1
+    points = lower + (upper - lower) * torch.rand(count, tiles.dim, generator=rng, dtype=F64)
+    centers = tiles.merge().centers.double() + tiles.merge().origin
+    near = torch.randint(len(centers), (count // 2,), generator=rng)
+    jitter = 0.3 * torch.randn(count // 2, tiles.dim, generator=rng, dtype=F64)
+    points[: count // 2] = centers[near] + jitter
+    rows, axis = torch.arange(count), torch.randint(tiles.dim, (count,), generator=rng)
+    border = origin[axis] + edge * ((points[rows, axis] - origin[axis]) / edge).round()
+    offset = 2 * torch.rand(count, generator=rng, dtype=F64) - 1
+    points[rows, axis] = border + within * offset
+    return points
