@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from lardhm_torch import checkpoint, joining, map_state, native, uncertainty
-from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances
+from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances, z_order
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
-from lardhm_torch.fitting import FitConfig, fit_weights, training_order
+from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.incremental import Task, UpdateConfig, updated
 from lardhm_torch.sampling import check_samples
 
@@ -262,7 +262,7 @@ class LardHilbertMap(nn.Module):
         dtype = self.centers.dtype
         rng = torch.Generator(device=points.device).manual_seed(seed)
         origin = points.mean(dim=0, dtype=torch.float64).round()
-        local, labels = to_frame(points, origin, dtype), labels.to(dtype)
+        local, labels = _along_curve(to_frame(points, origin, dtype), labels.to(dtype))
         clusters, is_occupied = cluster_classes(local, labels, num_clusters, rng)
         learned = LardHilbertMap(**self.settings).to(self.centers)
         learned._grow(clusters, is_occupied, origin)
@@ -342,7 +342,8 @@ class LardHilbertMap(nn.Module):
         task = Task(self.kernel, config or UpdateConfig(), rng)
         local = self._to_map_frame(points)
         state = map_state.read_state(self)
-        state = updated(state, local, labels.to(local.dtype), num_clusters, task)
+        samples = _along_curve(local, labels.to(local.dtype))
+        state = updated(state, *samples, num_clusters, task)
         map_state.write_state(self, state)
         return self
 
@@ -400,8 +401,7 @@ class LardHilbertMap(nn.Module):
     def _train_weights(
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
     ) -> None:
-        order = training_order(local, config.rows_a_batch(len(local)), rng)
-        local, labels = local[order], labels[order]
+        local, labels = deal_samples((local, labels), config.rows_a_batch(len(local)), rng)
 
         def features_of(rows: slice) -> tuple[Tensor, Tensor]:
             return self._nearest_features(local[rows])
@@ -473,6 +473,12 @@ class LardHilbertMap(nn.Module):
         if self.origin.dtype != torch.float64:
             self.origin = origin.to(self.origin.device)
         return self
+
+
+def _along_curve(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Samples in an order in which neighbors in space are neighbors in memory: all else is faster."""
+    order = z_order(points)
+    return points.index_select(0, order), labels.index_select(0, order)
 
 
 def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
