@@ -38,7 +38,8 @@ class LardHilbertMap(nn.Module):
             diagonals: any value is a valid factor. `scale_tril` is the kernel's.
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters.
         posterior_means, posterior_variances: (M,) buffers, the weights as `fit_uncertainty` knows
-            them; 0 for clusters that it has not seen.
+            them; variance 0 for clusters that it has not seen.
+        posterior_scales: (2,) buffer, factors on negative and on positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
@@ -53,6 +54,7 @@ class LardHilbertMap(nn.Module):
     scatters: Tensor
     posterior_means: Tensor
     posterior_variances: Tensor
+    posterior_scales: Tensor
     origin: Tensor
 
     def __init__(
@@ -85,6 +87,7 @@ class LardHilbertMap(nn.Module):
         self.register_buffer("scatters", torch.zeros(0, dim, dim))
         self.register_buffer("posterior_means", torch.zeros(0))
         self.register_buffer("posterior_variances", torch.zeros(0))
+        self.register_buffer("posterior_scales", torch.ones(2))
         self.register_load_state_dict_pre_hook(uncertainty.fill_missing)
         self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
         self._index = torch.empty(0, dtype=torch.uint8)
@@ -148,7 +151,8 @@ class LardHilbertMap(nn.Module):
         Raises:
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
-        return uncertainty.moderate(*self._posterior(points))
+        mean, variance = self._posterior(points)
+        return uncertainty.moderate(mean, uncertainty.OWN_SHARE * variance)
 
     def _posterior(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the log-odds at (..., D) points."""
@@ -162,6 +166,7 @@ class LardHilbertMap(nn.Module):
         for chunk in local.reshape(-1, self.dim).split(uncertainty.QUERY_CHUNK):
             indices, values = self._nearest_features(chunk)
             mean = (values * self.posterior_means[indices]).sum(dim=1)
+            mean = uncertainty.posterior_log_odds(mean, self.posterior_scales)
             variance = uncertainty.latent_variance(indices, values, self.posterior_variances)
             parts.append(torch.stack([mean, variance]))
         mean, variance = torch.cat(parts, dim=1).reshape(2, *local.shape[:-1])
@@ -295,9 +300,8 @@ class LardHilbertMap(nn.Module):
         log_odds = (values * self.weights[indices]).sum(dim=1)
         variances = uncertainty.weight_variances(indices, values, log_odds, len(self))
         samples = (indices, values, log_odds, labels.to(values.dtype))
-        scale = uncertainty.posterior_scale(*samples, variances)
-        self.posterior_means = scale * self.weights.detach()
-        self.posterior_variances = variances
+        self.posterior_scales = uncertainty.posterior_scales(*samples, variances)
+        self.posterior_means, self.posterior_variances = self.weights.detach().clone(), variances
         return self
 
     def update(
