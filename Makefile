@@ -41,3 +41,4 @@ bench: .venv/bench
 soak: .venv/ready
 	$(BIN)/python scripts/fuzz_readers.py
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0
+	$(BIN)/python scripts/soak_tiles.py --kills 20 --seed 0

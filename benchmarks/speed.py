@@ -35,8 +35,13 @@ from timing import Contender, compare, format_comparison, format_rows
 from workers import plain_path
 
 from lardhm_torch import FitConfig, LardHilbertMap, native
-from lardhm_torch.clustering import clusters_about, factor_covariances, mini_batch_kmeans
-from lardhm_torch.fitting import fit_weights, training_order
+from lardhm_torch.clustering import (
+    clusters_about,
+    factor_covariances,
+    mini_batch_kmeans,
+    z_order,
+)
+from lardhm_torch.fitting import deal_samples, fit_weights
 
 # Table I and II of the paper [ms]: 8 cores of 2.5 GHz, 500 clusters.
 PAPER_STAGES = {
@@ -160,7 +165,8 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
 
     def kmeans() -> list[torch.Tensor]:
         rng = torch.Generator().manual_seed(0)
-        return [mini_batch_kmeans(points, half, rng) for points in classes]
+        ordered = (points.index_select(0, z_order(points)) for points in classes)
+        return [mini_batch_kmeans(points, half, rng) for points in ordered]
 
     centers = kmeans()
 
@@ -170,8 +176,9 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
             factor_covariances(clusters.covariances, model.min_lengthscale)
 
     config, rng = FitConfig(), torch.Generator().manual_seed(0)
-    order = training_order(task.points, config.rows_a_batch(len(task.points)), rng)
-    local, labels = (task.points - model.origin.float())[order], task.labels[order]
+    order = z_order(task.points)
+    samples = ((task.points - model.origin.float())[order], task.labels[order])
+    local, labels = deal_samples(samples, config.rows_a_batch(len(task.points)), rng)
     state = (model.centers, model.raw_scale_tril, model.kernel)
     index = native.build_index(model.centers, model.num_neighbors)
 
@@ -201,7 +208,8 @@ def kmeans(arguments: argparse.Namespace) -> Result:
     half = NUM_CLUSTERS // 2
 
     def ours() -> torch.Tensor:
-        return mini_batch_kmeans(points, half, torch.Generator().manual_seed(0))
+        ordered = points.index_select(0, z_order(points))
+        return mini_batch_kmeans(ordered, half, torch.Generator().manual_seed(0))
 
     def theirs() -> Any:
         return sklearn_kmeans(points.numpy(), half)

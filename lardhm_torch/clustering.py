@@ -48,7 +48,7 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     """At most ``num_clusters`` clusters of the points, none of fewer than five unless there are fewer.
 
     Args:
-        points: (N, D) positions of one class [m].
+        points: (N, D) positions of one class [m], in the order of `z_order`.
         num_clusters: how many to look for; more than N / 5 means N / 5.
         rng: random state of the start and of the batches.
 
@@ -69,7 +69,7 @@ def cluster_classes(
     """Occupied and free points clustered apart, as the paper found to work better (Section II-B).
 
     Args:
-        points: (N, D) positions [m].
+        points: (N, D) positions [m], in the order of `z_order`.
         labels: (N,) 1 occupied, 0 free.
         num_clusters: total over both classes; None: chosen from the data.
         rng: random state.
@@ -130,11 +130,12 @@ def mini_batch_kmeans(
     Every batch point pulls its nearest center by 1 / (number of points that pulled it so far); a
     whole batch at a time this is the running mean of all points a center has met. We depart from
     Algorithm 1 twice, because each lowers the inertia by several percent: the random points of the
-    start are spread along a space-filling curve, and the counters start anew every
-    ``restart_every`` iterations, so that a center forgets the points it met on its way.
+    start and of the batches are spread along a space-filling curve, and the counters start anew
+    every ``restart_every`` iterations, so that a center forgets the points it met on its way.
 
     Args:
-        points: (N, D) positions [m].
+        points: (N, D) positions [m], in the order of `z_order`; in another order the result is
+            as valid, but worse.
         num_clusters: how many, at most N.
         rng: random state of the start and of the batches.
         iterations: t of Algorithm 1.
@@ -148,8 +149,7 @@ def mini_batch_kmeans(
     """
     batch_size = min(len(points), batch_size or 10 * num_clusters)
     centers = _stratified_start(points, num_clusters, rng)
-    shape = (iterations, batch_size)
-    rows = torch.randint(len(points), shape, generator=rng, device=rng.device)
+    rows = torch.stack([_spread_rows(len(points), batch_size, rng) for _ in range(iterations)])
     if native.supports(points):
         return torch.ops.lardhm.kmeans(points, centers, rows, batch_size, restart_every)
     met = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
@@ -165,19 +165,17 @@ def mini_batch_kmeans(
 
 
 def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -> Tensor:
-    """Random points, one from each of m stretches of the Z-order that are equally long in meters.
+    """Random points, one from each of m stretches of the order that are equally long in meters.
 
     A stretch is weighted by the distance between points a quarter of a cluster apart in the order:
     where points are sparse they are picked more often than their number says. Inertia is least
     at a density of centers between that of the points and uniform, and starts near it.
     """
     count = START_POINTS * num_clusters
-    if len(points) > count:
-        points = points[torch.randint(len(points), (count,), generator=rng, device=rng.device)]
-    ordered = points[z_order(points)]
-    if num_clusters >= len(points):
+    ordered = points[_spread_rows(len(points), count, rng)] if len(points) > count else points
+    if num_clusters >= len(ordered):
         return ordered
-    lag = max(1, len(points) // (4 * num_clusters))
+    lag = max(1, len(ordered) // (4 * num_clusters))
     gaps = torch.linalg.vector_norm(ordered[lag:] - ordered[:-lag], dim=1)
     ahead = torch.cat([gaps, gaps[-1:].expand(lag)])
     behind = torch.cat([gaps[:1].expand(lag), gaps])
@@ -185,7 +183,14 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     along = (weight + 1e-6 * weight.mean() + 1e-300).cumsum(0)
     share = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
     place = (torch.arange(num_clusters, device=rng.device) + share) / num_clusters * along[-1]
-    return ordered[torch.searchsorted(along, place).clamp(max=len(points) - 1)]
+    return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
+
+
+def _spread_rows(num_points: int, count: int, rng: torch.Generator) -> Tensor:
+    """(count,) random rows of N, ascending, one from each of as many equal stretches; count <= N."""
+    place = torch.rand(count, generator=rng, device=rng.device, dtype=torch.double)
+    place += torch.arange(count, device=rng.device)
+    return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
 
 def z_order(points: Tensor) -> Tensor:

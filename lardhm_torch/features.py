@@ -212,7 +212,8 @@ def log_odds(
     Source: Guizilini & Ramos 2016, eq. (1).
     """
     chunks = []
-    for chunk in points.split(QUERY_CHUNK):
+    whole = torch.compiler.is_compiling()  # an exported map takes any number of points
+    for chunk in [points] if whole else points.split(QUERY_CHUNK):
         indices, values = nearest_features(chunk, centers, scale_tril, num_neighbors)
         total = (values * weights[indices]).sum(dim=1)
         chunks.append(total.where(chunk.isfinite().all(dim=1), total.new_tensor(torch.nan)))

@@ -11,9 +11,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import native
-from lardhm_torch.clustering import z_order
 
-CHUNK_ROWS = 1 << 20  # points whose features are computed at a time
+CHUNK_ROWS = 1 << 21  # points whose features are computed at a time
 CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
 State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the slope
 FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
@@ -28,7 +27,7 @@ class FitConfig:
     batch_size=1)``; it leaves log-loss on the table (docs and benchmarks show how much).
     """
 
-    passes: int = 4  # over all points, in one random order
+    passes: int = 4  # over all points
     batch_size: int | None = None  # points a step; None: N / 128, at least 256
     learning_rate: float = 0.5  # eta of eq. (4)
     decay: bool = True  # eta falls linearly to 0; otherwise constant
@@ -57,22 +56,31 @@ class FitConfig:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
 
-def training_order(points: Tensor, batch_size: int, rng: torch.Generator) -> Tensor:
-    """(N, D) positions [m] -> (N,) rows in the order in which `fit_weights` should take them.
+def deal_samples(
+    columns: tuple[Tensor, ...], batch_size: int, rng: torch.Generator
+) -> tuple[Tensor, ...]:
+    """Samples along a space-filling curve -> the same in the order `fit_weights` should take them.
 
-    The points are sorted along a space-filling curve and dealt out to the batches in turn, each
-    round from another random batch on, and the batches are shuffled. So every batch is a sample of
-    all space, more even than a random one, and its neighbors in space lie next to each other in
-    memory.
+    They are dealt out to the batches in turn, each round from another random batch on. So every
+    batch is a sample of all space, more even than a random one, and its neighbors in space lie next
+    to each other in memory.
+
+    Args:
+        columns: (N, ...) positions, labels or features of the samples, in the order of `z_order`.
+        batch_size: samples a batch.
+        rng: random state.
     """
-    batches = -(-len(points) // batch_size)
-    rounds = -(-len(points) // batches)
-    rows = torch.full((rounds * batches,), -1, dtype=torch.long, device=points.device)
-    rows[: len(points)] = z_order(points)
+    count = len(columns[0])
+    batches = max(1, -(-count // batch_size))
+    rounds = -(-count // batches)
     first = torch.randint(batches, (rounds, 1), generator=rng, device=rng.device)
     turn = torch.randperm(batches, generator=rng, device=rng.device)
-    dealt = rows.reshape(rounds, batches).gather(1, (first + turn) % batches).T.reshape(-1)
-    return dealt[dealt >= 0]
+    batch = turn[(torch.arange(batches, device=rng.device) + first) % batches].reshape(-1)[:count]
+    sizes = torch.bincount(batch, minlength=batches)
+    place = (sizes.cumsum(0) - sizes)[batch]
+    place += torch.arange(count, device=rng.device) // batches
+    # Reading in order and writing to all batches at once is several times faster than a gather.
+    return tuple(torch.empty_like(column).index_copy_(0, place, column) for column in columns)
 
 
 def class_factors(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
@@ -112,13 +120,13 @@ def fit_weights(
 
     w <- w - eta_t A^-1 g, with g the gradient of a batch scaled to all points. The preconditioner
     A is the running root mean square of g, and g is smoothed over steps (Adam), so that weights of
-    rarely seen clusters learn as fast as others. Every pass takes the points in the order given:
-    bring them into that of `training_order` first. Features are computed once and kept up to
-    `CACHE_BYTES`, the others anew in every pass.
+    rarely seen clusters learn as fast as others. Points are taken in the order given: bring them
+    into that of `deal_samples` first. Features are computed once and kept up to `CACHE_BYTES`,
+    the others anew for every two passes, which then come at once.
 
     Args:
         features_of: slice of B rows -> indices (B, K) and kernel values (B, K) of those points.
-        labels: (N,) 1 occupied, 0 free, in training order.
+        labels: (N,) 1 occupied, 0 free, in the order of `deal_samples`.
         weights: (M,) start, left as it is.
         config: passes, rates and regularizer.
         progress: show a bar on a terminal.
@@ -137,12 +145,15 @@ def fit_weights(
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))
     state = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights))
     step = 0
-    for _ in tqdm(range(config.passes), "weights", disable=None if progress else True):
+    for passed in tqdm(range(config.passes), "weights", disable=None if progress else True):
         for rows in features.chunks(len(labels)):
+            if passed % 2 and not features.keeps(rows):
+                continue
             chunk = _Chunk(*features[rows], labels[rows], factors[rows])
-            native_path = native.descends(chunk.indices, chunk.values)
-            state = (_native_steps if native_path else _plain_steps)(chunk, state, step, plan)
-            step += -(-len(chunk.labels) // batch_size)
+            steps = _native_steps if native.descends(*chunk[:2]) else _plain_steps
+            for _ in range(1 if features.keeps(rows) else min(2, config.passes - passed)):
+                state = steps(chunk, state, step, plan)
+                step += -(-len(chunk.labels) // batch_size)
     return state[0]
 
 
@@ -175,9 +186,13 @@ class _Features:
         for start in range(0, num_rows, self.chunk_rows):
             yield slice(start, min(num_rows, start + self.chunk_rows))
 
+    def keeps(self, rows: slice) -> bool:
+        """Whether the features of a chunk are at hand."""
+        return rows.start in self.kept
+
     def __getitem__(self, rows: slice) -> tuple[Tensor, Tensor]:
         """Indices and kernel values (R, K) of one chunk."""
-        if rows.start in self.kept:
+        if self.keeps(rows):
             return self.kept[rows.start]
         found = self.features_of(rows)
         size = sum(tensor.numel() * tensor.element_size() for tensor in found)

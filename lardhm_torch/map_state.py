@@ -12,13 +12,15 @@ from torch import Tensor, nn
 from lardhm_torch import checkpoint
 from lardhm_torch.clustering import Clusters
 
+OF_THE_WHOLE = ("origin", "posterior_scales")  # tensors that are not a row a cluster
+
 
 def resize(model: Any, num_clusters: int) -> None:
     """Room for another number of clusters; parameters stay the same objects, so optimizers see it."""
     if len(model) == num_clusters:
         return
     for name, tensor in {**model._parameters, **model._buffers}.items():
-        if tensor is None or name == "origin":
+        if tensor is None or name in OF_THE_WHOLE:
             continue
         room = tensor.detach().new_zeros(num_clusters, *tensor.shape[1:])
         if isinstance(tensor, nn.Parameter):
@@ -57,7 +59,7 @@ def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
         raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
     num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
     for name, tensor in own.items():
-        shape = tensor.shape if name == "origin" else (num_clusters, *tensor.shape[1:])
+        shape = tensor.shape if name in OF_THE_WHOLE else (num_clusters, *tensor.shape[1:])
         if state[prefix + name].shape != torch.Size(shape):
             raise ValueError(
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "

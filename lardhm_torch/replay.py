@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import factor_covariances
+from lardhm_torch.clustering import factor_covariances, z_order
 from lardhm_torch.features import Kernel, raw_factors
-from lardhm_torch.fitting import FitConfig, fit_weights, training_order
+from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
 
 # Free points within four standard deviations of an occupied cluster (a kernel value of 0.0003)
@@ -170,11 +170,13 @@ def learn(
     The regularizer is spread over all that the evidence stands for, not over the few points that
     carry it: otherwise every scan would pull the weights further to zero.
     """
-    order = training_order(evidence.points, config.rows_a_batch(len(evidence)), rng)
-    labels, is_occupied, strength = (
-        column[order] for column in (evidence.labels, evidence.is_occupied, evidence.strength)
+    order = z_order(evidence.points)
+    columns = (evidence.labels, evidence.is_occupied, evidence.strength, *features)
+    labels, is_occupied, strength, indices, values = deal_samples(
+        tuple(column.index_select(0, order) for column in columns),
+        config.rows_a_batch(len(evidence)),
+        rng,
     )
-    indices, values = (column.index_select(0, order) for column in features)
     total, occupied = strength.sum(), (strength * is_occupied).sum()
     counts = strength * (len(evidence) / total)
     if config.balance and bool((occupied > 0) & (occupied < total)):

@@ -10,7 +10,8 @@ from lardhm_torch.uncertainty import (
     latent_variance,
     logistic_curvature,
     moderate,
-    posterior_scale,
+    posterior_log_odds,
+    posterior_scales,
     weight_variances,
 )
 
@@ -53,7 +54,7 @@ def test_variances_are_those_of_the_exact_posterior(count, prior_variance):
 def test_moderated_probability_is_the_exact_expectation():
     indices, values, labels = small_problem(30, 2)
     mean, _, weights, mass = exact_moments(values, labels, 1.0)
-    variances = weight_variances(indices, values, values @ mean, 2)
+    variances = weight_variances(indices, values, values @ mean, 2, 1.0)
     queries = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.1], [0.5, 0.5]], dtype=F64)
     exact = torch.sigmoid(weights @ queries.T).T @ mass
     pairs = torch.arange(2).repeat(len(queries), 1)
@@ -90,17 +91,24 @@ def test_latent_variance_by_hand():
     torch.testing.assert_close(got, torch.tensor([0.2, 2.0], dtype=F64))
 
 
-def test_half_trained_weights_are_scaled_up_and_overconfident_ones_down():
+def test_half_trained_weights_are_scaled_up_and_overconfident_ones_are_not():
     indices, values, labels = small_problem(4000, 2)
     mean, *_ = exact_moments(values[:500], labels[:500], 1.0)
     scales = []
     for factor in (0.4, 1.0, 3.0):
         log_odds = factor * (values @ mean)
         variances = weight_variances(indices, values, log_odds, 2)
-        scales.append(posterior_scale(indices, values, log_odds, labels, variances))
-    assert scales[0] > 1.3
-    assert 0.9 < scales[1] < 1.1
-    assert scales[2] < 0.8
+        scales.append(posterior_scales(indices, values, log_odds, labels, variances))
+    neutral = scales[2]  # overconfident weights are not made more so
+    assert (scales[0] > 1.2 * neutral).all()
+    assert (scales[1] < 1.1 * neutral).all()
+    assert (neutral < 1.05).all()
+
+
+def test_either_side_of_the_log_odds_has_its_own_factor():
+    mean = torch.tensor([-2.0, -1.0, 0.0, 1.0], dtype=F64)
+    got = posterior_log_odds(mean, torch.tensor([3.0, 2.0], dtype=F64))
+    torch.testing.assert_close(got, torch.tensor([-6.0, -3.0, 0.0, 2.0], dtype=F64))
 
 
 # --- the map ---
@@ -159,7 +167,8 @@ def test_the_posterior_is_saved_and_loaded(tmp_path):
 def test_maps_from_before_uncertainty_still_load(tmp_path):
     model, points, _ = doubting_map()
     state = model.state_dict()
-    del state["posterior_means"], state["posterior_variances"]
+    for name in ("posterior_means", "posterior_variances", "posterior_scales"):
+        del state[name]
     torch.save(state, tmp_path / "old.pt")
     old = LardHilbertMap.load(tmp_path / "old.pt")
     assert torch.equal(old(points), model(points))

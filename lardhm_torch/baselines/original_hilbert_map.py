@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch.fitting import FitConfig, fit_weights, training_order
+from lardhm_torch.clustering import z_order
+from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.hilbert_map import check_samples
 
 REACH = 2.5  # [cells] kernels end here, at exp(-2.5^2 / 2) = 4 % for a lengthscale of one cell
@@ -74,8 +75,9 @@ class OriginalHilbertMap:
         self.offsets = self._neighbor_offsets(points.shape[1]).to(points.device)
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
 
-        order = training_order(points, self.config.rows_a_batch(len(points)), rng)
-        points, labels = points[order], labels[order].to(self.dtype)
+        order = z_order(points)
+        samples = points[order], labels[order].to(self.dtype)
+        points, labels = deal_samples(samples, self.config.rows_a_batch(len(points)), rng)
 
         def features_of(rows: slice) -> tuple[Tensor, Tensor]:
             return self.features(points[rows])

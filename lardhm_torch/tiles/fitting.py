@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lardhm_torch.clustering import factor_covariances
+from lardhm_torch.clustering import factor_covariances, z_order
 from lardhm_torch.features import raw_factors
 from lardhm_torch.files import replaced_file
 from lardhm_torch.fitting import FitConfig
@@ -184,12 +184,14 @@ class _Job:
             partial.write_text(json.dumps({"chunks": self.ledger.chunks, **vars(record)}))
 
     def _points(self, index: Index) -> TilePoints:
-        """A tile's points in the frame of its map."""
+        """A tile's points in the frame of its map, along a space-filling curve."""
         counts = self.ledger.tiles[index]
         records = read_records(self.folder, index, counts, self.manifest.dim, MOST_POINTS)
         tile = unpack(records, self.device, self.empty.centers.dtype)
         shift = (self._corner(index) - self._origin(index)).to(tile.points)
-        return tile._replace(points=tile.points + shift)
+        order = z_order(tile.points)
+        points, labels, in_core = (column.index_select(0, order) for column in tile)
+        return TilePoints(points + shift, labels, in_core)
 
     def _around(self, index: Index) -> Iterator[TileClusters]:
         """The neighbors' clusters within two halos, in the frame of a tile."""

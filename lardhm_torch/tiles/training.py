@@ -28,7 +28,7 @@ from lardhm_torch.clustering import (
     factor_covariances,
 )
 from lardhm_torch.features import Kernel, raw_factors
-from lardhm_torch.fitting import FitConfig, fit_weights, training_order
+from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.tiles.samples import Counts, TilePoints
 
 # Clusters of best accuracy lie denser where points do, but less so: where there are twice the
@@ -97,7 +97,13 @@ class TileClusters(NamedTuple):
 def cluster_tile(
     tile: TilePoints, num_clusters: tuple[int, int], rng: torch.Generator
 ) -> TileClusters:
-    """Both classes of a tile's core, clustered apart; the occupied clusters first."""
+    """Both classes of a tile's core, clustered apart; the occupied clusters first.
+
+    Args:
+        tile: points in the order of `z_order`.
+        num_clusters: of the occupied and of the free points.
+        rng: random state.
+    """
     parts = []
     for label, total in zip((1, 0), num_clusters, strict=True):
         members = tile.points[tile.in_core & (tile.labels == label)]
@@ -117,7 +123,7 @@ def train_tile(
     """(M,) weights of a tile's own clusters.
 
     Args:
-        tile: points of the core and of the halo.
+        tile: points of the core and of the halo, in the order of `z_order`.
         own: M clusters of the core.
         around: the neighbors' clusters that reach into the halo, same frame.
         budget: what a point counts.
@@ -127,8 +133,8 @@ def train_tile(
     raw = raw_factors(factor_covariances(clusters.covariances, task.kernel.min_lengthscale))
     rows = max(LEAST_BATCH, len(tile.points) // 128)
     config = replace(task.config, batch_size=task.config.batch_size or rows)
-    order = training_order(tile.points, config.rows_a_batch(len(tile.points)), task.rng)
-    points, labels = tile.points[order], tile.labels[order]
+    size = config.rows_a_batch(len(tile.points))
+    points, labels = deal_samples((tile.points, tile.labels), size, task.rng)
     index = native.build_index(clusters.means, task.kernel.num_neighbors)
 
     def features_of(part: slice) -> tuple[Tensor, Tensor]:

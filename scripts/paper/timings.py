@@ -24,9 +24,9 @@ from lardhm_torch import (
 from lardhm_torch.baselines.local_gp import LocalGP
 from lardhm_torch.baselines.octomap import OctoMapBaseline, to_array
 from lardhm_torch.baselines.original_hilbert_map import OriginalHilbertMap
-from lardhm_torch.clustering import clusters_about, factor_covariances, mini_batch_kmeans
+from lardhm_torch.clustering import clusters_about, factor_covariances, mini_batch_kmeans, z_order
 from lardhm_torch.features import raw_factors
-from lardhm_torch.fitting import fit_weights, training_order
+from lardhm_torch.fitting import deal_samples, fit_weights
 
 NUM_CLUSTERS, NUM_NEIGHBORS, RESOLUTION = 500, 5, 0.05
 NUM_POINTS, NUM_QUERIES = 82_842, 638_683
@@ -85,6 +85,8 @@ def _stages(local: Tensor, labels: Tensor, grid: Tensor, seed: int) -> dict[str,
         took[name] = took.get(name, 0.0) + time.perf_counter() - start
         return result
 
+    order = timed("clustering", lambda: z_order(local))
+    local, labels = timed("clustering", lambda: (local[order], labels[order]))
     parts = []
     for members in (local[labels > 0.5], local[labels <= 0.5]):
         count = NUM_CLUSTERS // 2
@@ -102,8 +104,7 @@ def _stages(local: Tensor, labels: Tensor, grid: Tensor, seed: int) -> dict[str,
         index = native.build_index(centers, NUM_NEIGHBORS)
         return native.nearest_features(points, centers, factors, kernel, index)
 
-    order = training_order(local, FitConfig().rows_a_batch(len(local)), rng)
-    local, labels = local[order], labels[order]
+    local, labels = deal_samples((local, labels), FitConfig().rows_a_batch(len(local)), rng)
     indices, values = timed("training features", lambda: features(local))
 
     def trained(config: FitConfig) -> Tensor:
