@@ -31,6 +31,7 @@ SETS = (
 )
 SHARES = (0.5, 0.05)
 MAX_RAYS, MAX_TEST_RAYS = 40_000, 10_000
+SEED = 11  # of the split: no constant of the uncertainty was chosen on it
 SLICE_HEIGHT = 1.0  # [m]
 NUM_PLACES = 20_000  # where variance and distance are compared
 BINS = 20
@@ -41,15 +42,15 @@ def log_losses(data: Path, folder: Path) -> dict[str, Any]:
     """Log-loss on held-out rays without and with the variance, every 3-D set, two shares."""
     result: dict[str, Any] = {}
     for name in tqdm(SETS, "uncertainty", file=sys.stderr):
-        rays = rays_of(data, name, MAX_RAYS)
+        rays = rays_of(data, name, MAX_RAYS, SEED)
         for share in SHARES:
-            train, test = split_rays(rays, share)
-            model, _ = fit_with_doubt(sample_rays(train))
-            test = protocol_rays(test, MAX_TEST_RAYS)
+            train, test = split_rays(rays, share, SEED)
+            model, _ = fit_with_doubt(sample_rays(train, seed=SEED))
+            test = protocol_rays(test, MAX_TEST_RAYS, SEED)
             with torch.no_grad():
                 tables = {
-                    "plain": evaluate(model, test),
-                    "bayes": evaluate(model.bayesian_probability, test),
+                    "plain": evaluate(model, test, SEED),
+                    "bayes": evaluate(model.bayesian_probability, test, SEED),
                 }
             result.setdefault(name, {})[str(share)] = {
                 kind: {way: table[kind]["log_loss"] for way, table in tables.items()}
