@@ -132,20 +132,29 @@ class Stopwatch:
             yield item
 
 
-def single_fits(folder: Path, ledger: Ledger) -> float:
-    """Seconds a point of some tiles' own points fitted as maps of their own, median."""
+def single_fits(folder: Path, ledger: Ledger) -> tuple[float, float]:
+    """Seconds a point of some tiles' own points as maps of their own, median of the tiles.
+
+    Returns:
+        From the file of points to the map's file, as a tile of the folder is made; and of that the
+        fit alone, points in memory.
+    """
     manifest = read_manifest(folder)
     ranked = sorted(ledger.cores, key=lambda index: ledger.tiles[index].core)
-    seconds = []
+    whole, alone = [], []
     for place in range(SINGLE_TILES):  # spread over all points, not over all tiles
         chosen = _at_share(ledger, ranked, (place + 0.5) / SINGLE_TILES)
+        start = time.perf_counter()
         records = read_records(folder, chosen, ledger.tiles[chosen], manifest.dim, 1 << 23)
         tile = unpack(records, torch.device("cpu"), torch.float32)
         points, labels = tile.points[tile.in_core], tile.labels[tile.in_core]
-        start = time.perf_counter()
-        LardHilbertMap(**manifest.settings).fit(points, labels)
-        seconds.append((time.perf_counter() - start) / len(points))
-    return statistics.median(seconds)
+        read = time.perf_counter()
+        model = LardHilbertMap(**manifest.settings).fit(points, labels)
+        fitted = time.perf_counter()
+        model.save(folder.with_suffix(".pt"))
+        whole.append((time.perf_counter() - start) / len(points))
+        alone.append((fitted - read) / len(points))
+    return statistics.median(whole), statistics.median(alone)
 
 
 def _at_share(ledger: Ledger, ranked: list[Any], share: float) -> Any:
@@ -185,7 +194,9 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     points = sum(counts.core for counts in ledger.tiles.values())
     before = single_fits(arguments.folder, ledger)
     fitting = fit_city(arguments.folder, arguments.ranks)
-    single = statistics.mean([before, single_fits(arguments.folder, ledger)])
+    after = single_fits(arguments.folder, ledger)
+    whole, alone = (statistics.mean(pair) for pair in zip(before, after, strict=True))
+    each = fitting * max(1, arguments.ranks) / points
     manifest = read_manifest(arguments.folder)
     disk = {
         name: sum(f.stat().st_size for f in (arguments.folder / name).iterdir())
@@ -202,9 +213,11 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "tiling [s]": tiling,
         "fitting [s]": fitting,
         "tiling [us a point]": 1e6 * tiling / points,
-        "fitting [us a point and rank]": 1e6 * fitting * max(1, arguments.ranks) / points,
-        "single tile [us a point]": 1e6 * single,
-        "ratio": fitting * max(1, arguments.ranks) / points / single,
+        "fitting [us a point and rank]": 1e6 * each,
+        "single tile, file to file [us a point]": 1e6 * whole,
+        "single tile, in memory [us a point]": 1e6 * alone,
+        "ratio to file to file": each / whole,
+        "ratio to in memory": each / alone,
         "peak memory of a process [GiB]": peak_gib(),
         **{f"{name} [bytes]": size for name, size in disk.items()},
     }
@@ -225,7 +238,7 @@ def main() -> None:
     with one_thread():
         record["city"] = measure(arguments)
     for name, value in record["city"].items():
-        print(f"{name:<34}{value:,.3f}" if isinstance(value, float) else f"{name:<34}{value:,}")
+        print(f"{name:<40}{value:,.3f}" if isinstance(value, float) else f"{name:<40}{value:,}")
     write_json(arguments.json, record)
 
 

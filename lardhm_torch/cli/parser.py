@@ -129,7 +129,7 @@ def _tile_verbs(verb: Any) -> None:
     _scans(sub)
     sub.add_argument("-o", "--output", required=True, metavar="FOLDER")
     sub.add_argument("--edge", type=float, default=20.0, help="of a tile [m] (20)")
-    sub.add_argument("--halo", type=float, help="around a tile, trained with it [m] (1)")
+    sub.add_argument("--halo", type=float, help="around a tile, trained with it [m] (0.5)")
     sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
     sub.add_argument("--dim", type=int, help="2 drops a constant last column")
     _seed(sub)

@@ -8,10 +8,13 @@ up to 26 neighbors, so reading must take microseconds.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lardhm_torch.clustering import Clusters
@@ -20,6 +23,8 @@ from lardhm_torch.tiles.manifest import Index, tile_name
 from lardhm_torch.tiles.training import TileClusters
 
 _HEAD_BYTES = 16
+Corner = NDArray[np.float64]
+Box = tuple[Corner, Corner]
 
 
 def clusters_path(folder: str | os.PathLike[str], index: Index) -> Path:
@@ -49,26 +54,68 @@ def load_clusters(path: Path, like: Tensor) -> TileClusters:
     Raises:
         ValueError: the file is damaged.
     """
+    return _as_clusters(_table(path, like), like)
+
+
+def load_clusters_near(
+    sources: Iterable[tuple[Path, Corner]], box: Box, like: Tensor
+) -> TileClusters:
+    """The clusters of several files that lie in a box, as one.
+
+    Args:
+        sources: files, and where the origin of each file's frame lies (D,) [m].
+        box: lower and upper corner (D,) [m].
+        like: gives device, dtype and dimension.
+    """
     dim = like.shape[-1]
-    kind = np.float64 if like.dtype == torch.float64 else np.float32
-    if clustered_points(path, like) is None:
-        raise ValueError(f"{path} must hold clusters, whole; it does not. Run the fit again")
-    values = np.fromfile(path, kind, offset=_HEAD_BYTES)
-    table = torch.from_numpy(values).to(like.device).reshape(-1, 2 + dim + dim * dim)
-    occupied, counts, means, scatters = table.split([1, 1, dim, dim * dim], dim=1)
+    parts = [np.empty((0, 2 + dim + dim * dim), _kind(like))]
+    for path, shift in sources:
+        table = _table(path, like)
+        means = table[:, 2 : 2 + dim]
+        table = table[((means >= box[0] - shift) & (means <= box[1] - shift)).all(axis=1)]
+        table[:, 2 : 2 + dim] += shift
+        parts.append(table)
+    return _as_clusters(np.concatenate(parts), like)
+
+
+def _as_clusters(table: NDArray[Any], like: Tensor) -> TileClusters:
+    dim = like.shape[-1]
+    columns = torch.from_numpy(table).to(like.device)
+    occupied, counts, means, scatters = columns.split([1, 1, dim, dim * dim], dim=1)
     moments = Clusters(
         counts[:, 0].long(), means.contiguous(), scatters.reshape(-1, dim, dim).contiguous()
     )
     return TileClusters(moments, occupied[:, 0] > 0.5)
 
 
+def _table(path: Path, like: Tensor) -> NDArray[Any]:
+    found = _read(path, like)
+    if found is None:
+        raise ValueError(f"{path} must hold clusters, whole; it does not. Run the fit again")
+    return found[1]
+
+
+def _kind(like: Tensor) -> str:
+    return "<f8" if like.dtype == torch.float64 else "<f4"
+
+
 def clustered_points(path: Path, like: Tensor) -> int | None:
     """Of how many points the clusters in a file were made; None if there is no such file, whole."""
+    found = _read(path, like)
+    return None if found is None else found[0]
+
+
+def _read(path: Path, like: Tensor) -> tuple[int, NDArray[Any]] | None:
     try:
-        num_points, rows = np.fromfile(path, "<i8", 2).tolist()
-        size = path.stat().st_size
-    except (OSError, ValueError):
+        content = bytearray(path.read_bytes())
+    except OSError:
         return None
+    if len(content) < _HEAD_BYTES:
+        return None
+    num_points, rows = np.frombuffer(content, "<i8", 2).tolist()
     dim = like.shape[-1]
-    row_bytes = like.element_size() * (2 + dim + dim * dim)
-    return num_points if size == _HEAD_BYTES + rows * row_bytes else None
+    columns = 2 + dim + dim * dim
+    if len(content) != _HEAD_BYTES + rows * columns * like.element_size():
+        return None
+    table = np.frombuffer(content, _kind(like), offset=_HEAD_BYTES)
+    return num_points, table.reshape(rows, columns)

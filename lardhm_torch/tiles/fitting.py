@@ -18,8 +18,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lardhm_torch.clustering import factor_covariances, z_order
@@ -32,6 +33,7 @@ from lardhm_torch.tiles.cluster_files import (
     clustered_points,
     clusters_path,
     load_clusters,
+    load_clusters_near,
     save_clusters,
 )
 from lardhm_torch.tiles.manifest import (
@@ -45,7 +47,7 @@ from lardhm_torch.tiles.manifest import (
     write_manifest,
 )
 from lardhm_torch.tiles.ranks import Ranks, join_ranks, one_thread
-from lardhm_torch.tiles.samples import Counts, TilePoints, read_ledger, read_records, unpack
+from lardhm_torch.tiles.samples import HALO, Counts, TilePoints, read_ledger, read_records, unpack
 from lardhm_torch.tiles.training import (
     TileClusters,
     TrainingTask,
@@ -159,7 +161,7 @@ class _Job:
     def cluster(self, index: Index) -> None:
         """Phase one: the clusters of a tile's core to their file."""
         found = cluster_tile(
-            self._points(index),
+            self._points(index, core_alone=True),
             self.budget.num_clusters(self.ledger.tiles[index]),
             self._rng(index, "clusters"),
         )
@@ -167,14 +169,14 @@ class _Job:
 
     def train(self, index: Index) -> None:
         """Phase two: a tile's map, and its entry of the manifest, to ``fitted/``."""
-        own = self._clusters(index)
+        own = load_clusters(clusters_path(self.folder, index), self.empty.centers)
         kernel, tile = self.empty.kernel, self._points(index)
         task = TrainingTask(kernel, self.config, self._rng(index, "weights"))
-        weights = train_tile(tile, own, list(self._around(index)), self.budget, task)
+        weights = train_tile(tile, own, self._around(index), self.budget, task)
         clusters = own.clusters
         raw = raw_factors(factor_covariances(clusters.covariances, kernel.min_lengthscale))
         model = LardHilbertMap(**self.manifest.settings).to(weights)
-        model.origin = self._origin(index)
+        model.origin = torch.tensor(self._origin(index), device=self.device)
         moments = (clusters.counts, clusters.means, clusters.scatters)
         write_state(model, MapState(weights, clusters.means, raw, own.is_occupied, *moments))
         path = self._fitted_path(index, ".pt")
@@ -183,27 +185,28 @@ class _Job:
         with replaced_file(self._fitted_path(index, ".json"), durable=False) as partial:
             partial.write_text(json.dumps({"chunks": self.ledger.chunks, **vars(record)}))
 
-    def _points(self, index: Index) -> TilePoints:
+    def _points(self, index: Index, core_alone: bool = False) -> TilePoints:
         """A tile's points in the frame of its map, along a space-filling curve."""
         counts = self.ledger.tiles[index]
         records = read_records(self.folder, index, counts, self.manifest.dim, MOST_POINTS)
+        if core_alone:
+            records = records[records["kind"] < HALO]
         tile = unpack(records, self.device, self.empty.centers.dtype)
-        shift = (self._corner(index) - self._origin(index)).to(tile.points)
+        shift = tile.points.new_tensor(self._corner(index) - self._origin(index))
         order = z_order(tile.points)
         points, labels, in_core = (column.index_select(0, order) for column in tile)
         return TilePoints(points + shift, labels, in_core)
 
-    def _around(self, index: Index) -> Iterator[TileClusters]:
+    def _around(self, index: Index) -> TileClusters:
         """The neighbors' clusters within two halos, in the frame of a tile."""
-        origin = self._origin(index)
-        lower = (self._corner(index) - origin).to(self.empty.centers)
-        upper, margin = lower + self.manifest.edge, 2 * self.manifest.halo
-        for near in self._neighbors(index):
-            found = self._clusters(near)
-            found = found.moved((self._origin(near) - origin).to(lower))
-            means = found.clusters.means
-            inside = ((means >= lower - margin) & (means <= upper + margin)).all(dim=1)
-            yield found.rows(inside)
+        origin, margin = self._origin(index), 2 * self.manifest.halo
+        lower = self._corner(index) - origin - margin
+        box = (lower, lower + self.manifest.edge + 2 * margin)
+        sources = (
+            (clusters_path(self.folder, near), self._origin(near) - origin)
+            for near in self._neighbors(index)
+        )
+        return load_clusters_near(sources, box, self.empty.centers)
 
     def _neighbors(self, index: Index) -> Iterator[Index]:
         """The tiles that touch one, in order."""
@@ -212,12 +215,11 @@ class _Job:
             if near != index and self.ledger.tiles.get(near, Counts()).core:
                 yield near
 
-    def _corner(self, index: Index) -> Tensor:
-        """(D,) float64 lower corner of a tile, world frame [m]."""
-        place = torch.tensor(index, dtype=torch.float64, device=self.device) * self.manifest.edge
-        return place + torch.tensor(self.manifest.origin, dtype=torch.float64, device=self.device)
+    def _corner(self, index: Index) -> NDArray[np.float64]:
+        """(D,) lower corner of a tile, world frame [m]."""
+        return np.array(self.manifest.origin) + self.manifest.edge * np.array(index)
 
-    def _origin(self, index: Index) -> Tensor:
+    def _origin(self, index: Index) -> NDArray[np.float64]:
         """(D,) origin of a tile's map: whole meters, as in `LardHilbertMap.fit`."""
         return self._corner(index).round()
 
@@ -227,9 +229,6 @@ class _Job:
         return torch.Generator(device=self.device).manual_seed(seed)
 
     # --- files ---
-
-    def _clusters(self, index: Index) -> TileClusters:
-        return load_clusters(clusters_path(self.folder, index), self.empty.centers)
 
     def _fitted_path(self, index: Index, suffix: str) -> Path:
         return self.folder / "fitted" / f"{tile_name(index)}{suffix}"

@@ -49,7 +49,7 @@ class TilingConfig:
     """How the world is cut into tiles, and how scans become training points."""
 
     edge: float = 20.0  # [m] of a tile
-    halo: float | None = None  # [m] around a tile, trained with it; None: 1 m, half an edge at most
+    halo: float | None = None  # [m] around a tile, trained with it; None: 0.5 m, half an edge at most
     seed: int = 0  # of everything random; piece n of the scans is sampled with seed + n
     num_neighbors: int | None = None  # k of the maps; None: the default
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
@@ -151,7 +151,7 @@ def _begin(path: Path, first: Scans, config: TilingConfig) -> Manifest:
     neighbors = {} if config.num_neighbors is None else {"num_neighbors": config.num_neighbors}
     manifest = Manifest(
         edge=config.edge,
-        halo=min(1.0, config.edge / 2) if config.halo is None else config.halo,
+        halo=min(0.5, config.edge / 2) if config.halo is None else config.halo,
         origin=grid_origin(first.origins[0], config.edge),
         settings=LardHilbertMap(first.dim, **neighbors).settings,
         sampling=asdict(config.sampling),

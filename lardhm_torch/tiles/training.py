@@ -83,16 +83,6 @@ class TileClusters(NamedTuple):
     clusters: Clusters
     is_occupied: Tensor
 
-    def moved(self, shift: Tensor) -> TileClusters:
-        """The same in another frame, (D,) further [m]."""
-        return self._replace(clusters=replace(self.clusters, means=self.clusters.means + shift))
-
-    def rows(self, which: Tensor) -> TileClusters:
-        """Those of a mask."""
-        old = self.clusters
-        kept = Clusters(old.counts[which], old.means[which], old.scatters[which])
-        return TileClusters(kept, self.is_occupied[which])
-
 
 def cluster_tile(
     tile: TilePoints, num_clusters: tuple[int, int], rng: torch.Generator
@@ -116,7 +106,7 @@ def cluster_tile(
 def train_tile(
     tile: TilePoints,
     own: TileClusters,
-    around: list[TileClusters],
+    around: TileClusters,
     budget: Budget,
     task: TrainingTask,
 ) -> Tensor:
@@ -129,7 +119,7 @@ def train_tile(
         budget: what a point counts.
         task: kernel, settings, random state.
     """
-    clusters = concatenate_clusters([part.clusters for part in (own, *around)])
+    clusters = concatenate_clusters([own.clusters, around.clusters])
     raw = raw_factors(factor_covariances(clusters.covariances, task.kernel.min_lengthscale))
     rows = max(LEAST_BATCH, len(tile.points) // 128)
     config = replace(task.config, batch_size=task.config.batch_size or rows)
