@@ -191,11 +191,10 @@ class _Job:
         records = read_records(self.folder, index, counts, self.manifest.dim, MOST_POINTS)
         if core_alone:
             records = records[records["kind"] < HALO]
-        tile = unpack(records, self.device, self.empty.centers.dtype)
-        shift = tile.points.new_tensor(self._corner(index) - self._origin(index))
+        shift = self._corner(index) - self._origin(index)
+        tile = unpack(records, self.device, self.empty.centers.dtype, shift)
         order = z_order(tile.points)
-        points, labels, in_core = (column.index_select(0, order) for column in tile)
-        return TilePoints(points + shift, labels, in_core)
+        return TilePoints(*(column.index_select(0, order) for column in tile))
 
     def _around(self, index: Index) -> TileClusters:
         """The neighbors' clusters within two halos, in the frame of a tile."""

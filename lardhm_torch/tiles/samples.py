@@ -191,9 +191,11 @@ class TilePoints(NamedTuple):
     in_core: Tensor
 
 
-def unpack(records: Records, device: torch.device, dtype: torch.dtype) -> TilePoints:
-    """Records as tensors."""
-    points = torch.from_numpy(records["position"].copy())
+def unpack(
+    records: Records, device: torch.device, dtype: torch.dtype, shift: Any = 0.0
+) -> TilePoints:
+    """Records as tensors, the points moved by (D,) [m]."""
+    points = torch.from_numpy(records["position"] + np.asarray(shift, dtype=np.float32))
     kind = torch.from_numpy(records["kind"].copy()).to(device)
     labels = (kind & OCCUPIED).to(dtype)
     return TilePoints(points.to(device, dtype), labels, (kind & HALO) == 0)
