@@ -307,7 +307,9 @@ def test_a_cluster_takes_no_more_memory_than_is_counted(ops):
 def test_a_limit_too_small_for_a_block_is_an_error(tmp_path, monkeypatch):
     tiled(random_map(), tmp_path, monkeypatch)
     tiles = TiledMap.open(tmp_path / "tiles", memory_limit=1000)
-    with pytest.raises(ValueError, match=r"memory_limit must be \d+ bytes or more to hold a block"):
+    with pytest.raises(
+        ValueError, match=r"memory_limit must be \d+ bytes or more to hold the tiles"
+    ):
         tiles(torch.full((1, 3), 105.0))
     with pytest.raises(ValueError, match="to hold all clusters, which are asked for; got 1000"):
         _ = tiles.centers
