@@ -181,7 +181,7 @@ def damage(path, how):
 @pytest.mark.parametrize("how", ["a flipped bit", "cut short", "missing"])
 @pytest.mark.parametrize("block_clusters", [1, 10_000])
 def test_a_damaged_tile_is_named_and_the_rest_answers(how, block_clusters, tmp_path, monkeypatch):
-    model = random_map(clusters=3000)
+    model = random_map(clusters=1000)
     folder = tmp_path / "tiles"
     points = border_points(tiled(model, tmp_path, monkeypatch, block_clusters), 2000)
     expected = model(points)
@@ -191,8 +191,8 @@ def test_a_damaged_tile_is_named_and_the_rest_answers(how, block_clusters, tmp_p
     with pytest.raises(DamagedTileError, match="tile 0_0_0 of the map cannot be used") as caught:
         tiles(inside)
     assert caught.value.index == (0, 0, 0)
-    elsewhere = (points > 111).all(dim=1)
-    assert elsewhere.sum() > 100
+    elsewhere = (points > 113).all(dim=1)
+    assert elsewhere.sum() > 30
     torch.testing.assert_close(tiles(points[elsewhere]), expected[elsewhere])
     with pytest.raises(DamagedTileError, match="0_0_0"):
         tiles(points)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.map_state import OF_THE_WHOLE
 from lardhm_torch.tiles.manifest import (
     MANIFEST_NAME,
     Manifest,
@@ -50,7 +51,7 @@ def rows_of(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
     """A map of some clusters of another, in its frame."""
     result = LardHilbertMap(**model.settings).to(model.centers)
     tensors = {
-        name: tensor if not isinstance(tensor, Tensor) or name == "origin" else tensor[rows]
+        name: tensor[rows] if isinstance(tensor, Tensor) and name not in OF_THE_WHOLE else tensor
         for name, tensor in model.state_dict().items()
     }
     result.load_state_dict(tensors)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.map_state import OF_THE_WHOLE
 from lardhm_torch.tiles.manifest import Index, Manifest, file_checksum, tile_name, tile_path
 
 BYTES_A_CLUSTER = 200  # of a 3-D float32 map with its index, no less than measured; float64 twice
@@ -126,15 +127,19 @@ class TileStore:
 def joined(models: list[LardHilbertMap], settings: Any, origin: Tensor) -> LardHilbertMap:
     """One map of the clusters of all, in their order, in the frame of ``origin`` (D,) world [m].
 
-    Where that is a map's own frame its tensors keep every bit.
+    Where that is a map's own frame its tensors keep every bit. Posteriors stay if they were learned
+    together, of one map that was split; posteriors with other factors are no posterior of the whole.
     """
     result = LardHilbertMap(**settings)
     if models:
         states = [_in_frame(model, origin) for model in models]
         tensors = {name: torch.cat([state[name] for state in states]) for name in states[0]}
         result = result.to(models[0].centers)
-        extra = result.get_extra_state()
-        result.load_state_dict({**tensors, "origin": origin, "_extra_state": extra})
+        scales = torch.stack([model.posterior_scales for model in models])
+        if not torch.equal(scales, scales[:1].expand_as(scales)):
+            tensors["posterior_variances"].zero_()
+        whole = {"origin": origin, "posterior_scales": scales[0]}
+        result.load_state_dict({**tensors, **whole, "_extra_state": result.get_extra_state()})
     result.origin = origin.clone()
     return result.requires_grad_(False)
 
@@ -142,7 +147,9 @@ def joined(models: list[LardHilbertMap], settings: Any, origin: Tensor) -> LardH
 def _in_frame(model: LardHilbertMap, origin: Tensor) -> dict[str, Tensor]:
     """All (M, ...) tensors of a map, positions relative to another origin."""
     tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-    own = tensors.pop("origin")
+    own = tensors["origin"]
+    for name in OF_THE_WHOLE:
+        del tensors[name]
     if not torch.equal(own, origin):
         for name in ("centers", "means"):
             tensors[name] = (tensors[name].double() + (own - origin)).to(tensors[name].dtype)

@@ -69,7 +69,8 @@ class TiledMap:
         self._blocks = speaking_blocks(self._layout)
         self._block_indices = self._blocks.indices()
         self._cache = Cache(self.memory_limit)
-        self._missing: dict[int, dict[int, DamagedTileError]] = {}  # tiles by block
+        self._block_rows: dict[int, Tensor] = {}  # tiles by block
+        self._missing: dict[Any, dict[int, DamagedTileError]] = {}  # damaged tiles by joined map
 
     @classmethod
     def open(
@@ -270,11 +271,26 @@ class TiledMap:
 
     def _block(self, number: int, lower: Tensor, upper: Tensor) -> LardHilbertMap:
         """The map that answers in a block; damage matters only to the box asked for, (D,) to (D,)."""
-        model = self._cache.get(number)
-        if model is None:
+        if number not in self._block_rows:
             box = block_box(self._layout, self._block_indices[number])
-            rows = needed_tiles(self._layout, *box)
-            self._make_room(rows, "a block of the map")
+            self._block_rows[number] = needed_tiles(self._layout, *box)
+        return self._map_of(self._block_rows[number], lower, upper)
+
+    def _part(self, lower: Tensor, upper: Tensor) -> LardHilbertMap:
+        """The map that answers in a box (D,) to (D,): that of a block, if the box lies in one."""
+        corners = torch.stack([lower, upper])
+        first, last = tile_indices(corners, self._layout.origin, self._layout.block_edge)
+        number = int(self._blocks.find(first[None])[0])
+        if torch.equal(first, last) and number >= 0:
+            return self._block(number, lower, upper)
+        return self._map_of(needed_tiles(self._layout, lower, upper), lower, upper)
+
+    def _map_of(self, rows: Tensor, lower: Tensor, upper: Tensor) -> LardHilbertMap:
+        """One map of tiles (S,), kept; an error if one that the box (D,) to (D,) needs is damaged."""
+        key = ("joined", *rows.tolist())
+        model = self._cache.get(key)
+        if model is None:
+            self._make_room(rows, "the tiles that answer here")
             tiles, missing = [], {}
             for row in rows.tolist():
                 try:
@@ -282,24 +298,13 @@ class TiledMap:
                 except DamagedTileError as error:
                     missing[row] = error
             model = self._joined(tiles)
-            self._cache.put(number, model)
-            self._missing[number] = missing
-        if self._missing[number]:
+            self._cache.put(key, model)
+            self._missing[key] = missing
+        if self._missing[key]:
             for row in needed_tiles(self._layout, lower, upper).tolist():
-                if row in self._missing[number]:
-                    raise self._missing[number][row]
+                if row in self._missing[key]:
+                    raise self._missing[key][row]
         return model
-
-    def _part(self, lower: Tensor, upper: Tensor) -> LardHilbertMap:
-        """The map of a block, if the box (D,) to (D,) lies in one, or a map made for the box."""
-        first, last = self._number(torch.stack([lower, upper])).tolist()
-        index = tile_indices(
-            torch.stack([lower, upper]), self._layout.origin, self._layout.block_edge
-        )
-        if first >= 0 and first == last and bool((index[0] == index[1]).all()):
-            return self._block(first, lower, upper)
-        self._make_room(needed_tiles(self._layout, lower, upper), "a part of the map")
-        return self.merge((lower, upper))
 
     def _tile(self, row: int) -> LardHilbertMap:
         index = self._layout.indices[row]
