@@ -40,6 +40,7 @@ from lardhm_torch.tiles.manifest import (
     Index,
     Manifest,
     Tile,
+    file_checksum,
     read_manifest,
     tile_name,
     tile_path,
@@ -64,7 +65,7 @@ CLUSTER_SHARE = (
 
 @torch.no_grad()
 def fit_tiles(folder: str | os.PathLike[str], *, progress: bool = False) -> Manifest:
-    """Fit the tiles of a folder that are not fitted, or whose points have changed since.
+    """Fit the tiles of a folder that are not fitted, are damaged, or whose points have changed since.
 
     One thread, in this process; under `torchrun` the processes share the tiles. A killed job is
     continued by calling it again: at most the tiles in work are lost.
@@ -125,14 +126,14 @@ class _Job:
     # --- what is to do; decided by rank 0, largest first so that the ranks end together ---
 
     def wanted(self) -> list[Index]:
-        """Tiles that the manifest does not know as their points are now, or whose file is gone."""
+        """Tiles that the manifest does not know as their points are now, or whose file is damaged."""
         known = self.manifest.tiles
         return self._largest_first(
             index
             for index in self.ledger.cores
             if index not in known
             or known[index].num_points != self.ledger.tiles[index].core
-            or not tile_path(self.folder, index).is_file()
+            or not _is_whole(tile_path(self.folder, index), known[index])
         )
 
     def unclustered(self, wanted: list[Index]) -> list[Index]:
@@ -257,3 +258,7 @@ class _Job:
                 os.replace(path, tile_path(self.folder, index))
         write_manifest(self.folder, replace(self.manifest, tiles={**self.manifest.tiles, **found}))
         shutil.rmtree(self.folder / "fitted")
+
+
+def _is_whole(path: Path, entry: Tile) -> bool:
+    return path.is_file() and file_checksum(path) == entry.checksum
