@@ -49,7 +49,9 @@ class TilingConfig:
     """How the world is cut into tiles, and how scans become training points."""
 
     edge: float = 20.0  # [m] of a tile
-    halo: float | None = None  # [m] around a tile, trained with it; None: 0.5 m, half an edge at most
+    halo: float | None = (
+        None  # [m] around a tile, trained with it; None: 0.5 m, half an edge at most
+    )
     seed: int = 0  # of everything random; piece n of the scans is sampled with seed + n
     num_neighbors: int | None = None  # k of the maps; None: the default
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
