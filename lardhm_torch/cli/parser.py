@@ -138,8 +138,7 @@ def _tile_verbs(verb: Any) -> None:
     sub.add_argument("folder")
 
     sub = verb(tiling.join)
-    sub.add_argument("first")
-    sub.add_argument("second")
+    sub.add_argument("maps", nargs=2, metavar="MAP")
     sub.add_argument("-o", "--output", required=True, metavar="FILE")
     _seed(sub)
 

@@ -61,7 +61,7 @@ def join(arguments: argparse.Namespace) -> None:
     from lardhm_torch.tiles import fitting
     from lardhm_torch.tiles.folders import join_folders
 
-    first, second = arguments.first, arguments.second
+    first, second = arguments.maps
     if Path(first).is_dir() != Path(second).is_dir():
         raise ValueError(f"both must be map files or both tiled folders; got {first} and {second}")
     if not Path(first).is_dir():

@@ -2,7 +2,7 @@
 
 A folder holds ``manifest.json``, ``samples/<name>.*`` (training points routed to the tiles) and
 ``tiles/<name>.pt`` (one ordinary map file a tile). A tile is a cube of the world: that of index i
-spans ``origin + edge * i`` to ``origin + edge * (i + 1)``, and its name is its index, as "3_-1_0".
+spans ``origin + edge * i`` to ``origin + edge * (i + 1)``, and its name is its index, as ``3_-1_0``.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Manifest:
 
 
 def tile_name(index: Index) -> str:
-    """The file name of a tile without its extension: (3, -1, 0) -> "3_-1_0".
+    """The file name of a tile without its extension: (3, -1, 0) -> ``3_-1_0``.
 
     >>> tile_name((3, -1, 0))
     '3_-1_0'
