@@ -110,6 +110,11 @@ def raycast(
     origins, directions = unit_rays(model, origins, directions)
     step = min(surface_step(model) if step is None else step, max_range)
     level = math.log(threshold / (1 - threshold))
+    if hasattr(model, "query_rays"):
+        march = (step, max_range, level, level + EVIDENCE, surface == "peak")
+        answer = model.query_rays(origins, directions, march)
+        if answer is not None:
+            return answer
     maybe = _empty_space(model, level + EVIDENCE, step, max_range, len(directions))
     parts = []
     for part in torch.arange(len(directions), device=directions.device).split(RAYS_AT_ONCE):
