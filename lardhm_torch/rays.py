@@ -110,11 +110,11 @@ def raycast(
     origins, directions = unit_rays(model, origins, directions)
     step = min(surface_step(model) if step is None else step, max_range)
     level = math.log(threshold / (1 - threshold))
-    if hasattr(model, "query_rays"):
+    if getattr(model, "query_rays", None) is not None:
         march = (step, max_range, level, level + EVIDENCE, surface == "peak")
-        answer = model.query_rays(origins, directions, march)
-        if answer is not None:
-            return answer
+        ranges = model.query_rays(origins, directions, march)
+        if ranges is not None:
+            return ranges
     maybe = _empty_space(model, level + EVIDENCE, step, max_range, len(directions))
     parts = []
     for part in torch.arange(len(directions), device=directions.device).split(RAYS_AT_ONCE):
