@@ -34,7 +34,7 @@ from lardhm_torch import (
     stream_scans,
 )
 from lardhm_torch.baselines.octomap import new_tree, to_array
-from lardhm_torch.clustering import cluster_points, concatenate_clusters
+from lardhm_torch.clustering import cluster_points, concatenate_clusters, z_order
 from lardhm_torch.metrics import evaluate, protocol_rays
 from lardhm_torch.streaming import real_time
 
@@ -70,7 +70,9 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
     samples, rng = sample_rays(train), torch.Generator().manual_seed(0)
     model = LardHilbertMap()
     origin = samples.points.mean(dim=0).round()
-    local, labels = (samples.points - origin).float(), samples.labels
+    local = (samples.points - origin).float()
+    order = z_order(local)
+    local, labels = local[order], samples.labels[order]
     parts = [
         cluster_points(local[labels > 0.5], occupied, rng),
         cluster_points(local[labels <= 0.5], free, rng),

@@ -7,20 +7,20 @@ held to be true there; points drawn from the moments, labelled by the map, stand
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.clustering import factor_covariances, z_order
-from lardhm_torch.features import Kernel, raw_factors
+from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
+from lardhm_torch.native.update import explain, ordered_features
 
-# Free points within four standard deviations of an occupied cluster (a kernel value of 0.0003)
-# contradict it, if they are so many: single ones come from noise in range and pose.
-INSIDE = 0.000335
+# Free points within so many standard deviations of an occupied cluster contradict it, if they are
+# so many: single ones come from noise in range and pose.
+INSIDE = 4.0
 MIN_PASSES = 2
 
 
@@ -42,25 +42,29 @@ class Evidence:
         return len(self.points)
 
 
-def new_evidence(points: Tensor, labels: Tensor, limit: int, rng: torch.Generator) -> Evidence:
-    """New points, or ``limit`` of them at random that count for all, as many of each class.
+def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> list[Evidence]:
+    """New points of each class, or ``limit`` of them that count for all, as many of each class.
 
-    Both classes have the same total in the loss, so that an equal number of each says most.
+    Both classes have the same total in the loss, so that an equal number of each says most. The
+    points are drawn one from each of equally long stretches: points of one ray follow each other.
+
+    Args:
+        classes: (N, D) occupied and (N, D) free points [m].
+        limit: how many points at most.
+        rng: random state.
     """
-    is_occupied = labels > 0.5
-    if len(points) <= limit:
-        return Evidence(points, labels, is_occupied, torch.ones_like(labels))
-    classes = [is_occupied.nonzero().squeeze(1), (~is_occupied).nonzero().squeeze(1)]
     parts = []
-    for rows, other in (classes, classes[::-1]):
-        drawn = max(limit // 2, limit - len(other))
-        counts = max(1.0, len(rows) / drawn)
-        if len(rows) > drawn:
-            # with repetition: a permutation of a million points takes longer than the training
-            rows = rows[torch.randint(len(rows), (drawn,), generator=rng, device=rng.device)]
-        parts.append((rows, torch.full_like(labels[rows], counts)))
-    rows, strength = (torch.cat(columns) for columns in zip(*parts, strict=True))
-    return Evidence(points[rows], labels[rows], is_occupied[rows], strength)
+    for number, label in enumerate((1.0, 0.0)):
+        points, other = classes[number], classes[1 - number]
+        drawn, counts = min(len(points), max(limit // 2, limit - len(other))), 1.0
+        if drawn < len(points):
+            counts = len(points) / drawn
+            place = torch.rand(drawn, generator=rng, device=rng.device, dtype=torch.float64)
+            place += torch.arange(drawn, device=rng.device)
+            points = points.index_select(0, (place * counts).long().clamp(max=len(points) - 1))
+        labels = points.new_full((drawn,), label)
+        parts.append(Evidence(points, labels, labels > 0.5, torch.full_like(labels, counts)))
+    return parts
 
 
 def recalled_evidence(
@@ -83,28 +87,33 @@ def recalled_evidence(
     return Evidence(points, labels, is_occupied.reshape(-1), strength.reshape(-1))
 
 
-def remembered_strength(known: MapState, new: Evidence, memory: float, floor: float) -> Tensor:
+def remembered_strength(
+    known: MapState, new: list[Evidence], memory: float, floor: float
+) -> Tensor:
     """(M,) how many points the past of each cluster counts.
 
     As many as it has met, but not more than ``memory``. An occupied cluster that rays now pass
     through, so that the new points alone would call it free, counts no more than those that say so:
     old obstacles fade within a few scans however often they were seen.
+
+    Args:
+        known: M clusters.
+        new: occupied and free points of the scan, see `new_evidence`.
+        memory: the most points that a past may count.
+        floor: smallest standard deviation [m].
     """
     strength = known.counts.clamp(max=memory).to(known.means.dtype)
     occupied = known.is_occupied.nonzero().squeeze(1)
-    share = float(new.is_occupied.double().mean())
-    if len(occupied) == 0 or not 0 < share < 1:
+    if len(occupied) == 0 or not all(map(len, new)):
         return strength
     own = known.rows(occupied)
-    raw = raw_factors(factor_covariances(own.clusters.covariances, floor))
-    index, one = native.build_index(own.means, 1), Kernel(num_neighbors=1)
-    owner, value = native.nearest_features(new.points, own.means, raw, one, index)
-    inside = value.squeeze(1) > INSIDE
-    owner, kinds = owner.squeeze(1)[inside].long(), new.is_occupied[inside]
-    counts = new.strength[inside]
-    hits = torch.zeros_like(own.weights).index_add_(0, owner[kinds], counts[kinds])
-    passes = torch.zeros_like(own.weights).index_add_(0, owner[~kinds], counts[~kinds])
-    worth = passes * share / (1 - share)  # in units of hits, as if both classes had one total
+    factors = factor_covariances(own.clusters.covariances, floor)
+    hits, passes = (
+        explain(part.points, own.means, factors, INSIDE, INSIDE)[1] * part.strength[0]
+        for part in new
+    )
+    # in units of hits, as if both classes had one total
+    worth = passes * (len(new[0]) / len(new[1]))
     held = strength[occupied]
     denied = (worth > hits) & (passes >= MIN_PASSES)
     return strength.index_copy(0, occupied, torch.where(denied, held.minimum(worth), held))
@@ -127,41 +136,32 @@ def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator)
     return (clusters.means[:, None] + ball @ factors.mT).reshape(-1, dim)
 
 
-def around(seen: Tensor, state: MapState, num_neighbors: int) -> Tensor:
-    """(M,) bool: clusters that new points see among their nearest, and the nearest of those.
+def around(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
+    """(M,) bool: clusters that new points joined or made, their neighbors, and the next ones.
 
-    The weights of the first are pulled by the new points; what the others know must hold them.
+    The weights of the neighbors, too, are pulled by the new points; what the next ones know must
+    hold them.
     """
-    touched = torch.zeros_like(state.is_occupied)
-    touched[seen.reshape(-1).long()] = True
-    near = native.nearest_centers(state.centers[touched], state.centers, num_neighbors)
-    return touched.index_fill(0, near.reshape(-1), True)
+
+    def neighbors(mask: Tensor) -> Tensor:
+        near = native.nearest_centers(centers[mask], centers, num_neighbors, index)
+        return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
+
+    touched = changed | neighbors(changed)
+    return touched | neighbors(touched & ~changed)
 
 
-class Features(NamedTuple):
-    """(N, K) indices of the nearest clusters of evidence, and the kernel values."""
-
-    indices: Tensor
-    values: Tensor
-
-
-def answer(state: MapState, evidence: Evidence, kernel: Kernel, index: Tensor) -> Features:
-    """What the evidence makes the clusters answer."""
-    tensors = (state.centers, state.raw_scale_tril)
-    return Features(*native.nearest_features(evidence.points, *tensors, kernel, index))
-
-
-def join_evidence(parts: list[Evidence], features: list[Features]) -> tuple[Evidence, Features]:
-    """All points of several, in order, with their features."""
+def join_evidence(parts: list[Evidence]) -> Evidence:
+    """All points of several, in order."""
     names = [field.name for field in fields(Evidence)]
-    evidence = Evidence(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
-    return evidence, Features(*(torch.cat(columns) for columns in zip(*features, strict=True)))
+    return Evidence(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
 def learn(
-    weights: Tensor,
+    state: MapState,
     evidence: Evidence,
-    features: Features,
+    kernel: Kernel,
+    index: Tensor,
     config: FitConfig,
     rng: torch.Generator,
 ) -> Tensor:
@@ -169,13 +169,23 @@ def learn(
 
     The regularizer is spread over all that the evidence stands for, not over the few points that
     carry it: otherwise every scan would pull the weights further to zero.
+
+    Args:
+        state: M clusters and the weights to start from.
+        evidence: N points.
+        kernel: of the map.
+        index: of the centers, see `native.build_index`.
+        config: passes, rates and regularizer.
+        rng: random state.
     """
-    order = z_order(evidence.points)
-    columns = (evidence.labels, evidence.is_occupied, evidence.strength, *features)
-    labels, is_occupied, strength, indices, values = deal_samples(
-        tuple(column.index_select(0, order) for column in columns),
-        config.rows_a_batch(len(evidence)),
-        rng,
+    batch_size = config.rows_a_batch(len(evidence))
+    (order,) = deal_samples((z_order(evidence.points),), batch_size, rng)
+    indices, values = ordered_features(
+        evidence.points, order, state.centers, state.raw_scale_tril, kernel, index
+    )
+    labels, is_occupied, strength = (
+        column.index_select(0, order)
+        for column in (evidence.labels, evidence.is_occupied, evidence.strength)
     )
     total, occupied = strength.sum(), (strength * is_occupied).sum()
     counts = strength * (len(evidence) / total)
@@ -189,4 +199,4 @@ def learn(
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:
         return indices[rows], values[rows]
 
-    return fit_weights(features_of, labels, weights, scaled, factors=counts)
+    return fit_weights(features_of, labels, state.weights, scaled, factors=counts)

@@ -244,17 +244,16 @@ def test_an_interrupt_while_the_result_is_taken_over_leaves_the_map_as_it_was(mo
     from lardhm_torch import map_state
 
     model = wall_map()
-    before, assign = copy.deepcopy(model), map_state.assign_state
+    before, assign = copy.deepcopy(model), map_state.assign_rows
 
-    def interrupted(target, state):
-        monkeypatch.setattr(map_state, "assign_state", assign)
-        map_state.resize(target, len(state))
+    def interrupted(target, where, part):
+        monkeypatch.setattr(map_state, "assign_rows", assign)
         with torch.no_grad():
-            target.weights.copy_(state.weights)
-            target.centers.copy_(state.centers)
+            target.weights[where] = part.weights[: len(where)]
+            target.centers[len(before) :] = part.centers[len(where) :]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(map_state, "assign_state", interrupted)
+    monkeypatch.setattr(map_state, "assign_rows", interrupted)
     with pytest.raises(KeyboardInterrupt):
         model.update(*wall(at=at, seed=1), seed=1)
     assert same_map(model, before)
