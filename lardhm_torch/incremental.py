@@ -111,7 +111,7 @@ def updated(
     near = reaching(state.centers, state.raw_scale_tril, task.kernel, (box.min, box.max), REACH)
     nearby = near.nonzero().squeeze(1)
     known = state.rows(nearby)
-    classes = [points_where(points, labels > 0.5), points_where(points, labels <= 0.5)]
+    classes = split_classes(points, labels > 0.5)
     if task.config.as_in_paper:
         order = z_order(points)
         sorted_samples = (points.index_select(0, order), labels.index_select(0, order))
@@ -126,6 +126,14 @@ def updated(
             if total:
                 part = absorb(part, members, kind, total, task)
     return nearby, replace(part, weights=_train(part, known, classes, task))
+
+
+def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
+    """Occupied and free points; views where the occupied ones come first, as from `sample_rays`."""
+    count = int(is_occupied.sum())
+    if bool(is_occupied[:count].all()):
+        return [points[:count], points[count:]]
+    return [points_where(points, is_occupied), points_where(points, ~is_occupied)]
 
 
 def points_where(points: Tensor, mask: Tensor) -> Tensor:

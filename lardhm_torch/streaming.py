@@ -15,7 +15,7 @@ from tqdm import tqdm
 from lardhm_torch import checkpoint
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.incremental import UpdateConfig
-from lardhm_torch.sampling import SamplingConfig, sample_rays, usable_rays
+from lardhm_torch.sampling import NoUsableRayError, SamplingConfig, sample_rays
 from lardhm_torch.scans import Scans
 
 
@@ -156,11 +156,11 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         rng = torch.Generator(device=scan.ends.device).manual_seed(seed)
         rows = torch.randint(len(scan), (config.max_rays,), generator=rng, device=rng.device)
         scan = scan.select(rows)
-    usable, dropped = usable_rays(scan, config.sampling)
-    if not bool(usable.any()):
-        warnings.warn(f"scan {number} was passed over: no usable ray; {dropped}", stacklevel=3)
+    try:
+        samples = sample_rays(scan, config.sampling, seed=seed)
+    except NoUsableRayError as error:
+        warnings.warn(f"scan {number} was passed over: no usable ray; {error}", stacklevel=3)
         return
-    samples = sample_rays(scan, config.sampling, seed=seed)
     model.update(
         samples.points, samples.labels, config.num_clusters, seed=seed, config=config.update
     )
