@@ -107,8 +107,7 @@ def updated(
 
     Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
     """
-    box = points.aminmax(dim=0)
-    near = reaching(state.centers, state.raw_scale_tril, task.kernel, (box.min, box.max), REACH)
+    near = reaching(state.centers, state.raw_scale_tril, task.kernel, points, REACH)
     nearby = near.nonzero().squeeze(1)
     known = state.rows(nearby)
     classes = split_classes(points, labels > 0.5)

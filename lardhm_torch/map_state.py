@@ -118,7 +118,8 @@ class MapState:
 
     def rows(self, which: Tensor) -> MapState:
         """The clusters of a mask or of indices, in that order, as copies."""
-        return MapState(*(tensor[which] for tensor in self))
+        which = which.nonzero().squeeze(1) if which.dtype == torch.bool else which
+        return MapState(*(tensor.index_select(0, which) for tensor in self))
 
     def put(self, where: Tensor, part: MapState) -> MapState:
         """A copy with the first rows of ``part`` in the places ``where`` and its others at the end."""

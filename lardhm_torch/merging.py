@@ -78,7 +78,9 @@ def merge_clusters(
 
 def take_clusters(clusters: Clusters, rows: Tensor) -> Clusters:
     """The clusters of a mask or of indices, in that order."""
-    return Clusters(clusters.counts[rows], clusters.means[rows], clusters.scatters[rows])
+    rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
+    tensors = (clusters.counts, clusters.means, clusters.scatters)
+    return Clusters(*(tensor.index_select(0, rows) for tensor in tensors))
 
 
 def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> MapState:

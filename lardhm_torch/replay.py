@@ -122,17 +122,22 @@ def remembered_strength(
 def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator) -> Tensor:
     """(M * count, D) points uniform in ellipsoids with the clusters' means and covariances.
 
-    Cells of k-means end where the next begins; a normal distribution would reach far into it.
+    Cells of k-means end where the next begins; a normal distribution would reach far into it. Points
+    come in pairs on opposite sides of the mean and at radii spread evenly: a few stand for a cluster
+    better than as many independent ones.
     """
     clusters = known.clusters
     spread = clusters.scatters / clusters.counts.clamp(min=1)[:, None, None]
     factors = factor_covariances(spread, floor)
     num_clusters, dim = clusters.means.shape
-    shape = (num_clusters, count, dim)
+    pairs = -(-count // 2)
+    shape = (num_clusters, pairs, dim)
     direction = torch.randn(shape, generator=rng, device=rng.device, dtype=factors.dtype)
     direction /= torch.linalg.vector_norm(direction, dim=2, keepdim=True)
-    share = torch.rand(num_clusters, count, 1, generator=rng, device=rng.device).to(factors)
+    share = torch.rand(num_clusters, pairs, 1, generator=rng, device=rng.device).to(factors)
+    share = (share + torch.arange(pairs, device=rng.device)[:, None]) / pairs
     ball = (dim + 2) ** 0.5 * share ** (1 / dim) * direction
+    ball = torch.cat([ball, -ball], dim=1)[:, :count]
     return (clusters.means[:, None] + ball @ factors.mT).reshape(-1, dim)
 
 

@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "kernel.h"
+#include "sorting.h"
 #include "tensors.h"
 
 namespace lardhm {
@@ -241,26 +242,22 @@ struct Extents {
   }
 };
 
-Tensor reaching(const Tensor& given_centers, const Tensor& given_raw, const Tensor& given_lower,
-                const Tensor& given_upper, double stds, double covariance_scale,
-                double min_lengthscale) {
-  const Tensor lower = tidy(given_lower), upper = tidy(given_upper);
-  const Tensor weights = torch::stable::new_empty(given_centers, {given_centers.size(0)});
-  const Tensor no_index = torch::stable::new_empty(given_centers, {0}, ScalarType::Byte);
-  const MapTensors map(given_centers, given_raw, weights, no_index, covariance_scale,
-                       min_lengthscale);
-  const int64_t count = map.centers.size(0);
-  for (const Tensor* corner : {&lower, &upper})
-    STD_TORCH_CHECK(corner->numel() == map.centers.size(1) &&
-                        corner->scalar_type() == map.centers.scalar_type(),
-                    "the corners must be (D,), of the dtype of the centers");
+Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_points, double stds,
+                double covariance_scale, double min_lengthscale) {
+  const Tensor points = tidy(given_points);
+  check_rows("points", points, centers);
+  const int64_t count = centers.size(0);
+  const Tensor weights = torch::stable::new_empty(centers, {count});
+  const Tensor no_index = torch::stable::new_empty(centers, {0}, ScalarType::Byte);
+  const MapTensors map(centers, raw, weights, no_index, covariance_scale, min_lengthscale);
   const Tensor found = torch::stable::new_empty(map.centers, {count}, ScalarType::Bool);
   bool* to = out<bool>(found);
   dispatch(map.centers, [&](auto type, auto dim) {
     using T = decltype(type);
-    const Extents<T, dim()> extents{in<T>(map.centers), in<T>(map.raw), in<T>(lower),
-                                    in<T>(upper), T(stds * std::sqrt(covariance_scale)),
-                                    T(min_lengthscale)};
+    Box<T, dim()> box;
+    box.add(in<T>(points), 0, points.size(0), 1);
+    const Extents<T, dim()> extents{in<T>(map.centers), in<T>(map.raw), box.low, box.high,
+                                    T(stds * std::sqrt(covariance_scale)), T(min_lengthscale)};
     constexpr int64_t kGrain = 8192;
     run_tasks((count + kGrain - 1) / kGrain, [&](int64_t task) {
       const int64_t end = std::min(count, (task + 1) * kGrain);
@@ -282,7 +279,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
       "ordered_features(Tensor points, Tensor order, Tensor centers, Tensor raw_scale_tril, "
       "Tensor index, int k, float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
   m.def(
-      "reaching(Tensor centers, Tensor raw_scale_tril, Tensor lower, Tensor upper, float stds, "
+      "reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
       "float covariance_scale, float min_lengthscale) -> Tensor");
 }
 

@@ -10,24 +10,24 @@ from lardhm_torch.features import Kernel
 
 
 def reaching(
-    centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, box: tuple[Tensor, Tensor], stds: float
+    centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, points: Tensor, stds: float
 ) -> Tensor:
-    """Which kernels reach into a box: along every axis, a number of standard deviations far.
+    """Which kernels reach into the box around points: along every axis, some standard deviations far.
 
     Args:
         centers: (M, D) cluster centers [m].
         raw_scale_tril: (M, D, D) factors with the logarithm of their diagonals.
         kernel: covariance scale and floor.
-        box: (D,) lower and (D,) upper corner [m].
+        points: (N, D) positions [m], at least one, finite.
         stds: how far a kernel is taken to reach, in its own standard deviations.
 
     Returns:
         (M,) bool.
     """
-    lower, upper = box
     if native.supports(centers):
-        given = (centers, raw_scale_tril, lower, upper)
-        return torch.ops.lardhm.reaching(*(t.detach() for t in given), stds, *kernel[1:])
+        given = (t.detach() for t in (centers, raw_scale_tril, points))
+        return torch.ops.lardhm.reaching(*given, stds, *kernel[1:])
+    lower, upper = points.aminmax(dim=0)
     factors = features.kernel_factors(raw_scale_tril, kernel)
     reach = stds * torch.linalg.vector_norm(factors, dim=2)
     return ((centers + reach >= lower) & (centers - reach <= upper)).all(dim=1)
