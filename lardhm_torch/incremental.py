@@ -32,11 +32,12 @@ from lardhm_torch.merging import append_clusters, merge_clusters, pool_into, tak
 from lardhm_torch.native.update import explain, reaching
 from lardhm_torch.replay import (
     around,
+    contradicted,
+    forget,
     join_evidence,
     learn,
     new_evidence,
     recalled_evidence,
-    remembered_strength,
 )
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
@@ -124,7 +125,7 @@ def updated(
         for kind, members, total in zip((True, False), classes, totals, strict=True):
             if total:
                 part = absorb(part, members, kind, total, task)
-    return nearby, replace(part, weights=_train(part, known, classes, task))
+    return nearby, _train(part, known, classes, task)
 
 
 def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
@@ -140,22 +141,26 @@ def points_where(points: Tensor, mask: Tensor) -> Tensor:
     return points.index_select(0, mask.nonzero().squeeze(1))
 
 
-def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -> Tensor:
-    """(M,) weights trained on the new points and on what the clusters around them recall."""
+def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -> MapState:
+    """Weights trained on the new points and on what the clusters around them recall."""
     config, kernel, rng = task.config, task.kernel, task.rng
     index = native.build_index(part.centers, kernel.num_neighbors)
     new = new_evidence(classes, config.max_points, rng)
     if not config.replay or len(known) == 0:
-        return learn(part, join_evidence(new), kernel, index, config.fit, rng)
+        learned = learn(part, join_evidence(new), kernel, index, config.fit, rng)
+        return replace(part, weights=learned)
     changed = torch.ones_like(part.is_occupied)
     changed[: len(known)] = (part.means[: len(known)] != known.means).any(dim=1)
     moving = around(changed, part.centers, kernel.num_neighbors, index)
     rows = moving[: len(known)].nonzero().squeeze(1)
-    strength = remembered_strength(known.rows(rows), new, config.memory, kernel.min_lengthscale)
+    worth = contradicted(known, classes, kernel.min_lengthscale, rng)
+    strength = known.counts.clamp(max=config.memory).to(worth).minimum(worth)[rows]
     strength = (strength / config.replay)[:, None].expand(-1, config.replay)
     old = recalled_evidence(known, rows, kernel, strength, rng)
     learned = learn(part, join_evidence([*new, old]), kernel, index, config.fit, rng)
-    return torch.where(moving, learned, part.weights)
+    return replace(
+        forget(part, worth, config.memory), weights=torch.where(moving, learned, part.weights)
+    )
 
 
 def absorb(

@@ -12,16 +12,15 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import factor_covariances, z_order
+from lardhm_torch.clustering import MIN_COUNT, factor_covariances, z_order
 from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
 from lardhm_torch.native.update import explain, ordered_features
 
-# Free points within so many standard deviations of an occupied cluster contradict it, if they are
-# so many: single ones come from noise in range and pose.
-INSIDE = 4.0
-MIN_PASSES = 2
+INSIDE = 4.0  # standard deviations from an occupied cluster, within which free points contradict it
+KEPT = 0.25  # of a contradicted cluster's past
+LOOKED_AT = 100_000  # points of each class of a scan that may contradict
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,23 @@ class Evidence:
         return len(self.points)
 
 
+def spread_rows(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
+    """(count, D) of the points, one from each of as many equal stretches; all if there are no more.
+
+    Points of one ray follow each other, so that all rays get their share.
+    """
+    if count >= len(points):
+        return points
+    place = torch.rand(count, generator=rng, device=rng.device, dtype=torch.float64)
+    place += torch.arange(count, device=rng.device)
+    rows = (place * (len(points) / count)).long().clamp_(max=len(points) - 1)
+    return points.index_select(0, rows)
+
+
 def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> list[Evidence]:
     """New points of each class, or ``limit`` of them that count for all, as many of each class.
 
-    Both classes have the same total in the loss, so that an equal number of each says most. The
-    points are drawn one from each of equally long stretches: points of one ray follow each other.
+    Both classes have the same total in the loss, so that an equal number of each says most.
 
     Args:
         classes: (N, D) occupied and (N, D) free points [m].
@@ -55,15 +66,11 @@ def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> lis
     """
     parts = []
     for number, label in enumerate((1.0, 0.0)):
-        points, other = classes[number], classes[1 - number]
-        drawn, counts = min(len(points), max(limit // 2, limit - len(other))), 1.0
-        if drawn < len(points):
-            counts = len(points) / drawn
-            place = torch.rand(drawn, generator=rng, device=rng.device, dtype=torch.float64)
-            place += torch.arange(drawn, device=rng.device)
-            points = points.index_select(0, (place * counts).long().clamp(max=len(points) - 1))
-        labels = points.new_full((drawn,), label)
-        parts.append(Evidence(points, labels, labels > 0.5, torch.full_like(labels, counts)))
+        members, other = classes[number], classes[1 - number]
+        points = spread_rows(members, max(limit // 2, limit - len(other)), rng)
+        labels = points.new_full((len(points),), label)
+        strength = torch.full_like(labels, len(members) / max(1, len(points)))
+        parts.append(Evidence(points, labels, labels > 0.5, strength))
     return parts
 
 
@@ -87,36 +94,46 @@ def recalled_evidence(
     return Evidence(points, labels, is_occupied.reshape(-1), strength.reshape(-1))
 
 
-def remembered_strength(
-    known: MapState, new: list[Evidence], memory: float, floor: float
+def contradicted(
+    known: MapState, classes: list[Tensor], floor: float, rng: torch.Generator
 ) -> Tensor:
-    """(M,) how many points the past of each cluster counts.
+    """(M,) how many points of an occupied cluster's past a scan leaves it; elsewhere infinity.
 
-    As many as it has met, but not more than ``memory``. An occupied cluster that rays now pass
-    through, so that the new points alone would call it free, counts no more than those that say so:
-    old obstacles fade within a few scans however often they were seen.
+    A scan contradicts an occupied cluster if its rays pass through, so that the new points alone
+    would call it free. It is then worth no more than the points that say so, however often it was
+    seen before: old obstacles fade.
 
     Args:
         known: M clusters.
-        new: occupied and free points of the scan, see `new_evidence`.
-        memory: the most points that a past may count.
+        classes: (N, D) occupied and (N, D) free points of the scan [m].
         floor: smallest standard deviation [m].
+        rng: random state of which points are looked at.
     """
-    strength = known.counts.clamp(max=memory).to(known.means.dtype)
+    worth = torch.full_like(known.weights, torch.inf)
     occupied = known.is_occupied.nonzero().squeeze(1)
-    if len(occupied) == 0 or not all(map(len, new)):
-        return strength
+    if len(occupied) == 0 or not all(map(len, classes)):
+        return worth
     own = known.rows(occupied)
     factors = factor_covariances(own.clusters.covariances, floor)
-    hits, passes = (
-        explain(part.points, own.means, factors, INSIDE, INSIDE)[1] * part.strength[0]
-        for part in new
-    )
+    drawn = [spread_rows(points, LOOKED_AT, rng) for points in classes]
+    hits, passes = (explain(part, own.means, factors, INSIDE, INSIDE)[1] for part in drawn)
     # in units of hits, as if both classes had one total
-    worth = passes * (len(new[0]) / len(new[1]))
-    held = strength[occupied]
-    denied = (worth > hits) & (passes >= MIN_PASSES)
-    return strength.index_copy(0, occupied, torch.where(denied, held.minimum(worth), held))
+    hits *= len(classes[0]) / len(drawn[0])
+    passes *= len(classes[0]) / len(drawn[1])
+    return worth.index_copy_(0, occupied, passes.where(passes > hits, torch.inf))
+
+
+def forget(part: MapState, worth: Tensor, memory: float) -> MapState:
+    """Clusters that a scan contradicts lose most of their past: what is kept is `KEPT` of it.
+
+    Their covariances stay, and their past counts as at most ``memory`` before it is cut. See
+    `contradicted` for what ``worth`` is: (Q,), of the first Q clusters.
+    """
+    worth = torch.cat([worth, worth.new_full((len(part) - len(worth),), torch.inf)])
+    kept = (KEPT * part.counts.clamp(max=memory)).long().clamp(min=MIN_COUNT)
+    counts = torch.where(worth < kept, kept, part.counts).minimum(part.counts)
+    share = (counts - 1).clamp(min=1) / (part.counts - 1).clamp(min=1)
+    return replace(part, counts=counts, scatters=part.scatters * share.to(worth)[:, None, None])
 
 
 def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator) -> Tensor:
