@@ -88,9 +88,9 @@ def accuracy(arguments: argparse.Namespace) -> list[Row]:
     rows = []
     for name in tqdm(arguments.sets, "accuracy", disable=None):
         rays = protocol_rays(load_scans(arguments.data / name / "scans.npz"), 120_000)
-        train, test = split_rays(rays, 0.5)
-        scans = single_scans(train)
-        shuffled = torch.randperm(len(scans), generator=torch.Generator().manual_seed(0)).tolist()
+        train, test = split_rays(rays, 0.5, seed=arguments.seed)
+        scans, rng = single_scans(train), torch.Generator().manual_seed(arguments.seed)
+        shuffled = torch.randperm(len(scans), generator=rng).tolist()
         orders = {
             "given": scans,
             "reversed": scans[::-1],
@@ -264,6 +264,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--sets", nargs="+", default=list(SETS))
     parser.add_argument("--only", nargs="+", choices=[part.__name__ for part in PARTS])
+    parser.add_argument("--seed", type=int, default=0, help="of the split in accuracy")
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "incremental.json")
     arguments = parser.parse_args()
     missing = [name for name in arguments.sets if not (arguments.data / name).is_dir()]

@@ -18,7 +18,7 @@ from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
 from lardhm_torch.native.update import explain, ordered_features
 
-INSIDE = 4.0  # standard deviations from an occupied cluster, within which free points contradict it
+INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
 KEPT = 0.25  # of a contradicted cluster's past
 LOOKED_AT = 100_000  # points of each class of a scan that may contradict
 
