@@ -43,7 +43,7 @@ from lardhm_torch.replay import (
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
 REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
 # The map recalls its own leaning to hits, so that new points need no more of it.
-UPDATE_FIT = FitConfig(passes=4, l2=0.01, occupied_share=0.5)
+UPDATE_FIT = FitConfig(passes=4, batch_size=1024, l2=0.01, occupied_share=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class UpdateConfig:
     fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
     refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
     max_points: int = 30_000  # that train the weights, at random; all points enter the clusters
-    replay: int = 6  # points recalled from an old cluster; 0: train on new points only
+    replay: int = 8  # points recalled from an old cluster; 0: train on new points only
     memory: float = 400.0  # a cluster's past counts at most as many points: the world may change
     fit: FitConfig = UPDATE_FIT
 

@@ -99,9 +99,8 @@ def contradicted(
 ) -> Tensor:
     """(M,) how many points of an occupied cluster's past a scan leaves it; elsewhere infinity.
 
-    A scan contradicts an occupied cluster if its rays pass through, so that the new points alone
-    would call it free. It is then worth no more than the points that say so, however often it was
-    seen before: old obstacles fade.
+    A scan contradicts an occupied cluster if its rays pass through and none ends there. It is then
+    worth no more than the points that say so, however often it was seen before: old obstacles fade.
 
     Args:
         known: M clusters.
@@ -118,9 +117,9 @@ def contradicted(
     drawn = [spread_rows(points, LOOKED_AT, rng) for points in classes]
     hits, passes = (explain(part, own.means, factors, INSIDE, INSIDE)[1] for part in drawn)
     # in units of hits, as if both classes had one total
-    hits *= len(classes[0]) / len(drawn[0])
     passes *= len(classes[0]) / len(drawn[1])
-    return worth.index_copy_(0, occupied, passes.where(passes > hits, torch.inf))
+    denied = (passes > 0) & (hits == 0)
+    return worth.index_copy_(0, occupied, passes.where(denied, torch.inf))
 
 
 def forget(part: MapState, worth: Tensor, memory: float) -> MapState:

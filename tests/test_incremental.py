@@ -388,7 +388,7 @@ def test_a_contradicted_cluster_forgets_most_of_its_past_and_keeps_its_shape():
     torch.testing.assert_close(after.clusters.covariances, part.clusters.covariances)
 
 
-def test_only_occupied_clusters_that_more_rays_pass_than_hit_are_contradicted():
+def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     points = wall()[0]
     rng = torch.Generator().manual_seed(0)
     clusters = cluster_points(points[:600], 8, rng)
