@@ -20,7 +20,7 @@ from lardhm_torch.native.update import explain, ordered_features
 
 INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
 KEPT = 0.25  # of a contradicted cluster's past
-LOOKED_AT = 100_000  # points of each class of a scan that may contradict
+LOOKED_AT = 50_000  # points of each class of a scan that may contradict
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
     fit = replace(config.update.fit, batch_size=2048)
     return replace(
         config,
-        max_clusters=7_000,
+        max_clusters=6_800,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
         update=replace(config.update, max_points=20_000, replay=3, fit=fit),
     )
