@@ -42,6 +42,7 @@ from lardhm_torch.replay import (
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
 REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
+LOOKED_AT = 4  # times as many points may contradict old clusters as train the weights
 # The map recalls its own leaning to hits, so that new points need no more of it.
 UPDATE_FIT = FitConfig(passes=4, batch_size=1024, l2=0.01, occupied_share=0.5)
 
@@ -153,7 +154,8 @@ def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -
     changed[: len(known)] = (part.means[: len(known)] != known.means).any(dim=1)
     moving = around(changed, part.centers, kernel.num_neighbors, index)
     rows = moving[: len(known)].nonzero().squeeze(1)
-    worth = contradicted(known, classes, kernel.min_lengthscale, rng)
+    looked_at = LOOKED_AT * config.max_points
+    worth = contradicted(known, classes, looked_at, kernel.min_lengthscale, rng)
     strength = known.counts.clamp(max=config.memory).to(worth).minimum(worth)[rows]
     strength = (strength / config.replay)[:, None].expand(-1, config.replay)
     old = recalled_evidence(known, rows, kernel, strength, rng)

@@ -20,7 +20,6 @@ from lardhm_torch.native.update import explain, ordered_features
 
 INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
 KEPT = 0.25  # of a contradicted cluster's past
-LOOKED_AT = 50_000  # points of each class of a scan that may contradict
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ def recalled_evidence(
 
 
 def contradicted(
-    known: MapState, classes: list[Tensor], floor: float, rng: torch.Generator
+    known: MapState, classes: list[Tensor], limit: int, floor: float, rng: torch.Generator
 ) -> Tensor:
     """(M,) how many points of an occupied cluster's past a scan leaves it; elsewhere infinity.
 
@@ -105,6 +104,7 @@ def contradicted(
     Args:
         known: M clusters.
         classes: (N, D) occupied and (N, D) free points of the scan [m].
+        limit: how many points of each class are looked at.
         floor: smallest standard deviation [m].
         rng: random state of which points are looked at.
     """
@@ -114,7 +114,7 @@ def contradicted(
         return worth
     own = known.rows(occupied)
     factors = factor_covariances(own.clusters.covariances, floor)
-    drawn = [spread_rows(points, LOOKED_AT, rng) for points in classes]
+    drawn = [spread_rows(points, limit, rng) for points in classes]
     hits, passes = (explain(part, own.means, factors, INSIDE, INSIDE)[1] for part in drawn)
     # in units of hits, as if both classes had one total
     passes *= len(classes[0]) / len(drawn[1])

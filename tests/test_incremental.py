@@ -394,11 +394,11 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     clusters = cluster_points(points[:600], 8, rng)
     known = state_of(clusters, torch.arange(len(clusters)) % 2 > 0)
     hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
-    worth = contradicted(known, [hits, free], 0.01, rng)
+    worth = contradicted(known, [hits, free], 10_000, 0.01, rng)
     assert torch.equal(worth.isfinite(), known.is_occupied)
-    as_often = contradicted(known, [free, free], 0.01, rng)
+    as_often = contradicted(known, [free, free], 10_000, 0.01, rng)
     assert not as_often.isfinite().any()
-    nothing = contradicted(known, [hits[:0], free], 0.01, rng)
+    nothing = contradicted(known, [hits[:0], free], 10_000, 0.01, rng)
     assert not nothing.isfinite().any()
 
 
