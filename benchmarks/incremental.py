@@ -34,7 +34,7 @@ from lardhm_torch import (
     stream_scans,
 )
 from lardhm_torch.baselines.octomap import new_tree, to_array
-from lardhm_torch.clustering import cluster_points, concatenate_clusters
+from lardhm_torch.clustering import cluster_points, concatenate_clusters, z_order
 from lardhm_torch.metrics import evaluate, protocol_rays
 from lardhm_torch.streaming import real_time
 
@@ -70,7 +70,9 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
     samples, rng = sample_rays(train), torch.Generator().manual_seed(0)
     model = LardHilbertMap()
     origin = samples.points.mean(dim=0).round()
-    local, labels = (samples.points - origin).float(), samples.labels
+    local = (samples.points - origin).float()
+    order = z_order(local)
+    local, labels = local[order], samples.labels[order]
     parts = [
         cluster_points(local[labels > 0.5], occupied, rng),
         cluster_points(local[labels <= 0.5], free, rng),
@@ -86,9 +88,9 @@ def accuracy(arguments: argparse.Namespace) -> list[Row]:
     rows = []
     for name in tqdm(arguments.sets, "accuracy", disable=None):
         rays = protocol_rays(load_scans(arguments.data / name / "scans.npz"), 120_000)
-        train, test = split_rays(rays, 0.5)
-        scans = single_scans(train)
-        shuffled = torch.randperm(len(scans), generator=torch.Generator().manual_seed(0)).tolist()
+        train, test = split_rays(rays, 0.5, seed=arguments.seed)
+        scans, rng = single_scans(train), torch.Generator().manual_seed(arguments.seed)
+        shuffled = torch.randperm(len(scans), generator=rng).tolist()
         orders = {
             "given": scans,
             "reversed": scans[::-1],
@@ -262,6 +264,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--sets", nargs="+", default=list(SETS))
     parser.add_argument("--only", nargs="+", choices=[part.__name__ for part in PARTS])
+    parser.add_argument("--seed", type=int, default=0, help="of the split in accuracy")
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "incremental.json")
     arguments = parser.parse_args()
     missing = [name for name in arguments.sets if not (arguments.data / name).is_dir()]

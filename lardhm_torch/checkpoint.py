@@ -33,7 +33,14 @@ def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
             _write_safetensors(state, partial)
         else:
             with open(partial, "wb") as file:
-                torch.save(state, file)
+                torch.save({name: _without_reserve(value) for name, value in state.items()}, file)
+
+
+def _without_reserve(value: Any) -> Any:
+    """A tensor that is a view of more memory (a map that grows) as a copy: torch writes all of it."""
+    if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
+        return value.clone()
+    return value
 
 
 def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:

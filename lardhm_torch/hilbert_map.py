@@ -91,6 +91,7 @@ class LardHilbertMap(nn.Module):
         self.register_load_state_dict_pre_hook(uncertainty.fill_missing)
         self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
         self._index = torch.empty(0, dtype=torch.uint8)
+        self._reserves: dict[str, tuple[int, int]] = {}  # of `map_state.resize`
         self.register_load_state_dict_pre_hook(map_state.make_room)
 
     # --- what the map knows ---
@@ -362,9 +363,8 @@ class LardHilbertMap(nn.Module):
         task = Task(self.kernel, config or UpdateConfig(), rng)
         local = self._to_map_frame(points)
         state = map_state.read_state(self)
-        samples = _along_curve(local, labels.to(local.dtype))
-        state = updated(state, *samples, num_clusters, task)
-        map_state.write_state(self, state)
+        changes = updated(state, local, labels.to(local.dtype), num_clusters, task)
+        map_state.write_rows(self, *changes)
         return self
 
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:

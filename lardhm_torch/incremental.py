@@ -20,27 +20,31 @@ from lardhm_torch.clustering import (
     Clusters,
     cluster_classes,
     cluster_points,
+    clusters_about,
     factor_covariances,
     split_clusters,
+    z_order,
 )
-from lardhm_torch.features import Kernel, kernel_factors, raw_factors
+from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig
 from lardhm_torch.map_state import MapState
 from lardhm_torch.merging import append_clusters, merge_clusters, pool_into, take_clusters, whitened
+from lardhm_torch.native.update import explain, reaching
 from lardhm_torch.replay import (
-    answer,
     around,
+    contradicted,
+    forget,
     join_evidence,
     learn,
     new_evidence,
     recalled_evidence,
-    remembered_strength,
 )
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
-KERNEL_STDS = 2.0  # how far a cluster is taken to reach when those near a scan are chosen
+REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
+LOOKED_AT = 4  # times as many points may contradict old clusters as train the weights
 # The map recalls its own leaning to hits, so that new points need no more of it.
-UPDATE_FIT = FitConfig(passes=2, l2=0.01, occupied_share=0.5)
+UPDATE_FIT = FitConfig(passes=4, batch_size=1024, l2=0.01, occupied_share=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +57,8 @@ class UpdateConfig:
     reach: float = 4.0  # nearer points make no new cluster
     fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
     refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
-    max_points: int = 100_000  # that train the weights, at random; all points enter the clusters
-    replay: int = 16  # points recalled from an old cluster; 0: train on new points only
+    max_points: int = 30_000  # that train the weights, at random; all points enter the clusters
+    replay: int = 8  # points recalled from an old cluster; 0: train on new points only
     memory: float = 400.0  # a cluster's past counts at most as many points: the world may change
     fit: FitConfig = UPDATE_FIT
 
@@ -86,8 +90,8 @@ class Task(NamedTuple):
 
 def updated(
     state: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
-) -> MapState:
-    """The map with one more scan: clusters pooled or appended, weights trained.
+) -> tuple[Tensor, MapState]:
+    """One more scan: clusters pooled or appended, weights trained.
 
     Only clusters near the points are read, so that the cost does not grow with the map. Old
     clusters keep their rows; new ones come after them.
@@ -99,23 +103,38 @@ def updated(
         num_clusters: total over both classes if no point were explained yet; None: from the data.
         task: kernel, settings, random state.
 
+    Returns:
+        ((Q,) rows of the clusters near the points; what becomes of them, in that order, and after
+        them the new clusters).
+
     Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
     """
-    nearby = near_points(state, points, task.kernel).nonzero().squeeze(1)
+    near = reaching(state.centers, state.raw_scale_tril, task.kernel, points, REACH)
+    nearby = near.nonzero().squeeze(1)
     known = state.rows(nearby)
+    classes = split_classes(points, labels > 0.5)
     if task.config.as_in_paper:
-        new, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
+        order = z_order(points)
+        sorted_samples = (points.index_select(0, order), labels.index_select(0, order))
+        new, is_occupied = cluster_classes(*sorted_samples, num_clusters, task.rng)
         part = merge_clusters(
             known, new, is_occupied, task.config.zeta, task.kernel.min_lengthscale
         )
     else:
         part = known
-        classes = [points_where(points, labels > 0.5), points_where(points, labels <= 0.5)]
         totals = split_clusters([len(members) for members in classes], num_clusters)
         for kind, members, total in zip((True, False), classes, totals, strict=True):
             if total:
                 part = absorb(part, members, kind, total, task)
-    return state.put(nearby, replace(part, weights=_train(part, known, points, labels, task)))
+    return nearby, _train(part, known, classes, task)
+
+
+def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
+    """Occupied and free points; views where the occupied ones come first, as from `sample_rays`."""
+    count = int(is_occupied.sum())
+    if bool(is_occupied[:count].all()):
+        return [points[:count], points[count:]]
+    return [points_where(points, is_occupied), points_where(points, ~is_occupied)]
 
 
 def points_where(points: Tensor, mask: Tensor) -> Tensor:
@@ -123,32 +142,27 @@ def points_where(points: Tensor, mask: Tensor) -> Tensor:
     return points.index_select(0, mask.nonzero().squeeze(1))
 
 
-def near_points(state: MapState, points: Tensor, kernel: Kernel) -> Tensor:
-    """(M,) bool: the clusters whose kernel reaches into the box around the points."""
-    reach = KERNEL_STDS * torch.linalg.vector_norm(
-        kernel_factors(state.raw_scale_tril, kernel), dim=2
-    )
-    lower, upper = points.aminmax(dim=0)
-    return ((state.centers + reach >= lower) & (state.centers - reach <= upper)).all(dim=1)
-
-
-def _train(part: MapState, known: MapState, points: Tensor, labels: Tensor, task: Task) -> Tensor:
-    """(M,) weights trained on the new points and on what the clusters around them recall."""
+def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -> MapState:
+    """Weights trained on the new points and on what the clusters around them recall."""
     config, kernel, rng = task.config, task.kernel, task.rng
     index = native.build_index(part.centers, kernel.num_neighbors)
-    new = new_evidence(points, labels, config.max_points, rng)
-    seen = answer(part, new, kernel, index)
+    new = new_evidence(classes, config.max_points, rng)
     if not config.replay or len(known) == 0:
-        return learn(part.weights, new, seen, config.fit, rng)
-    moving = around(seen.indices, part, kernel.num_neighbors)
+        learned = learn(part, join_evidence(new), kernel, index, config.fit, rng)
+        return replace(part, weights=learned)
+    changed = torch.ones_like(part.is_occupied)
+    changed[: len(known)] = (part.means[: len(known)] != known.means).any(dim=1)
+    moving = around(changed, part.centers, kernel.num_neighbors, index)
     rows = moving[: len(known)].nonzero().squeeze(1)
-    strength = remembered_strength(known.rows(rows), new, config.memory, kernel.min_lengthscale)
+    looked_at = LOOKED_AT * config.max_points
+    worth = contradicted(known, classes, looked_at, kernel.min_lengthscale, rng)
+    strength = known.counts.clamp(max=config.memory).to(worth).minimum(worth)[rows]
     strength = (strength / config.replay)[:, None].expand(-1, config.replay)
     old = recalled_evidence(known, rows, kernel, strength, rng)
-    recalled = answer(part, old, kernel, index)
-    evidence, features = join_evidence([new, old], [seen, recalled])
-    learned = learn(part.weights, evidence, features, config.fit, rng)
-    return torch.where(moving, learned, part.weights)
+    learned = learn(part, join_evidence([*new, old]), kernel, index, config.fit, rng)
+    return replace(
+        forget(part, worth, config.memory), weights=torch.where(moving, learned, part.weights)
+    )
 
 
 def absorb(
@@ -172,6 +186,7 @@ def absorb(
     rest = points_where(points, look.unexplained)
     if len(rest) < MIN_COUNT:
         return part
+    rest = rest.index_select(0, z_order(rest))
     share = -(-num_clusters * len(rest) // len(points))
     new = cluster_points(rest, share, task.rng)
     new, where = _settle(known, new, look, task)
@@ -198,31 +213,14 @@ def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) ->
         everything = torch.ones(len(points), dtype=torch.bool, device=points.device)
         return _Look(everything, clusters, known.is_occupied, known.is_occupied)
     factors = factor_covariances(clusters.covariances, task.kernel.min_lengthscale)
-    index = native.build_index(clusters.means, 1)
-    raw, nearest = raw_factors(factors), Kernel(num_neighbors=1)
-    owner, value = native.nearest_features(points, clusters.means, raw, nearest, index)
-    owner, value = owner.squeeze(1), value.squeeze(1)
-    joining = points_where(points, value >= _closeness(config.radius))
-    found = _moments(joining, clusters.means)
+    near = (config.radius, config.reach)
+    owners, *moments = explain(points, clusters.means, factors, *near)
+    found = clusters_about(clusters.means, *moments)
     outgrown = found.counts > config.refine * clusters.counts.clamp(min=2 * usual_count)
     covered = outgrown & (_spread(found) > COVERED * _spread(clusters))
-    stays = (~outgrown).to(clusters.counts.dtype)
-    found = Clusters(found.counts * stays, found.means, found.scatters)
-    explained = (value >= _closeness(config.reach)) & ~outgrown.index_select(0, owner)
-    return _Look(~explained, found, outgrown, covered)
-
-
-def _closeness(stds: float) -> float:
-    """The kernel's value at a distance of so many standard deviations."""
-    return float(torch.exp(torch.tensor(-0.5 * stds**2)))
-
-
-def _moments(points: Tensor, centers: Tensor) -> Clusters:
-    """Moments of the points nearest to each center."""
-    _, counts, sums, scatters = native.assign(points, centers)
-    shift = sums / counts.clamp(min=1)[:, None]
-    between = counts[:, None, None] * shift[:, :, None] * shift[:, None, :]
-    return Clusters(counts.long(), centers + shift, scatters - between)
+    found = Clusters(found.counts * ~outgrown, found.means, found.scatters)
+    unexplained = torch.cat([outgrown, outgrown.new_ones(1)]).index_select(0, owners)
+    return _Look(unexplained, found, outgrown, covered)
 
 
 def _spread(clusters: Clusters) -> Tensor:

@@ -15,13 +15,7 @@ from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.fitting import FitConfig
 from lardhm_torch.map_state import MapState, read_state, write_state
 from lardhm_torch.merging import match_clusters, moved_factors
-from lardhm_torch.replay import (
-    Evidence,
-    answer,
-    join_evidence,
-    learn,
-    recalled_evidence,
-)
+from lardhm_torch.replay import Evidence, join_evidence, learn, recalled_evidence
 
 ZETA = 1.0  # [m] clusters of two maps that are farther apart never match (Algorithm 2)
 RECALLED = 16  # points drawn from each cluster to see whether two maps contradict each other
@@ -179,18 +173,18 @@ def _settled(
     joined: MapState, ours: MapState, theirs: MapState, kernel: Kernel, rng: torch.Generator
 ) -> MapState:
     """The joined clusters with new weights wherever they contradict the maps they come from."""
+    evidence = join_evidence([_everything(state, kernel, rng) for state in (ours, theirs)])
+    tensors = (joined.centers, joined.raw_scale_tril, joined.weights, kernel)
     index = native.build_index(joined.centers, kernel.num_neighbors)
-    parts = [_everything(state, kernel, rng) for state in (ours, theirs)]
-    evidence, features = join_evidence(
-        parts, [answer(joined, part, kernel, index) for part in parts]
-    )
-    probability = (features.values * joined.weights[features.indices.long()]).sum(dim=1).sigmoid()
+    probability = native.occupancy(evidence.points, *tensors, probability=True, index=index)
     contested = (probability - evidence.labels).abs() > TOLERANCE
     if not bool(contested.any()):
         return joined
-    open_rows = torch.zeros_like(joined.is_occupied)
-    open_rows[features.indices[contested].reshape(-1).long()] = True
-    learned = learn(joined.weights, evidence, features, FitConfig(l2=0.01), rng)
+    near = native.nearest_centers(
+        evidence.points[contested], joined.centers, kernel.num_neighbors, index
+    )
+    open_rows = torch.zeros_like(joined.is_occupied).index_fill_(0, near.reshape(-1), True)
+    learned = learn(joined, evidence, kernel, index, FitConfig(l2=0.01), rng)
     return replace(joined, weights=torch.where(open_rows, learned, joined.weights))
 
 

@@ -13,20 +13,52 @@ from lardhm_torch import checkpoint
 from lardhm_torch.clustering import Clusters
 
 OF_THE_WHOLE = ("origin", "posterior_scales")  # tensors that are not a row a cluster
+RESERVE = 0.25  # of a map's clusters: room that a growing map keeps for more
 
 
-def resize(model: Any, num_clusters: int) -> None:
-    """Room for another number of clusters; parameters stay the same objects, so optimizers see it."""
+def resize(model: Any, num_clusters: int, *, keep: bool = False) -> None:
+    """Room for another number of clusters; parameters stay the same objects, so optimizers see it.
+
+    Args:
+        model: a map.
+        num_clusters: how many clusters it is to have.
+        keep: whether clusters keep their values, and the map a reserve for more to come, so that
+            growing a little, again and again, does not copy the map each time; otherwise all is 0.
+    """
     if len(model) == num_clusters:
         return
     for name, tensor in {**model._parameters, **model._buffers}.items():
         if tensor is None or name in OF_THE_WHOLE:
             continue
-        room = tensor.detach().new_zeros(num_clusters, *tensor.shape[1:])
+        room = _longer(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
         if isinstance(tensor, nn.Parameter):
             _give_room(tensor, room)
         else:
             setattr(model, name, room)
+
+
+def _zeros(tensor: Tensor, rows: int) -> Tensor:
+    return tensor.detach().new_zeros(rows, *tensor.shape[1:])
+
+
+def _longer(model: Any, name: str, rows: int) -> Tensor:
+    """The tensor with more or fewer rows, the added ones 0: in its own storage where that is enough.
+
+    Only a reserve that was made here is used: behind another view lies somebody else's memory.
+    """
+    tensor = getattr(model, name).detach()
+    storage, before = tensor.untyped_storage(), len(tensor)
+    made_here = model._reserves.get(name) == (storage.data_ptr(), storage.nbytes())
+    bytes_a_row = tensor.element_size() * tensor[:1].numel() if before else 0
+    if not made_here or not 0 < rows * bytes_a_row <= storage.nbytes():
+        reserve = _zeros(tensor, rows + int(RESERVE * rows))
+        reserve[: min(rows, before)] = tensor[:rows]
+        storage = reserve.untyped_storage()
+        model._reserves[name] = (storage.data_ptr(), storage.nbytes())
+        return reserve[:rows]
+    longer = tensor.as_strided((rows, *tensor.shape[1:]), tensor.stride(), 0)
+    longer[before:] = 0
+    return longer
 
 
 def _give_room(parameter: nn.Parameter, room: Tensor) -> None:
@@ -86,7 +118,8 @@ class MapState:
 
     def rows(self, which: Tensor) -> MapState:
         """The clusters of a mask or of indices, in that order, as copies."""
-        return MapState(*(tensor[which] for tensor in self))
+        which = which.nonzero().squeeze(1) if which.dtype == torch.bool else which
+        return MapState(*(tensor.index_select(0, which) for tensor in self))
 
     def put(self, where: Tensor, part: MapState) -> MapState:
         """A copy with the first rows of ``part`` in the places ``where`` and its others at the end."""
@@ -125,6 +158,35 @@ def write_state(model: Any, state: MapState) -> None:
     except BaseException:
         assign_state(model, before)
         raise
+
+
+def write_rows(model: Any, where: Tensor, part: MapState) -> None:
+    """Give clusters of a map other values and append new ones: all or, if anything fails, none.
+
+    What it costs depends on the rows that change, not on the size of the map.
+
+    Args:
+        model: a map of M clusters.
+        where: (Q,) rows.
+        part: what to write there, and after the first Q rows the clusters to append.
+    """
+    size, before = len(model), read_state(model).rows(where)
+    try:
+        resize(model, size + len(part) - len(where), keep=True)
+        assign_rows(model, where, part)
+    except BaseException:
+        resize(model, size, keep=True)
+        assign_rows(model, where, before)
+        raise
+    model.posterior_variances.zero_()
+
+
+def assign_rows(model: Any, where: Tensor, part: MapState) -> None:
+    """Copy rows into a map, tensor by tensor; those after the first ``len(where)`` to its end."""
+    count, added = len(where), len(part) - len(where)
+    for tensor, rows in zip(read_state(model), part, strict=True):
+        tensor.index_copy_(0, where, rows[:count])
+        tensor[len(tensor) - added :] = rows[count:]
 
 
 def assign_state(model: Any, state: MapState) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lardhm_torch import native
 from lardhm_torch.clustering import (
     Clusters,
     concatenate_clusters,
@@ -77,7 +78,9 @@ def merge_clusters(
 
 def take_clusters(clusters: Clusters, rows: Tensor) -> Clusters:
     """The clusters of a mask or of indices, in that order."""
-    return Clusters(clusters.counts[rows], clusters.means[rows], clusters.scatters[rows])
+    rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
+    tensors = (clusters.counts, clusters.means, clusters.scatters)
+    return Clusters(*(tensor.index_select(0, rows) for tensor in tensors))
 
 
 def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> MapState:
@@ -86,21 +89,31 @@ def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> 
     Centers and factors move by the change of the moments, so that what tuning learned stays.
     """
     before = known.rows(where)
-    groups = torch.arange(len(where), device=where.device).repeat(2)
-    pooled = pool_clusters(
-        concatenate_clusters([before.clusters, found]), groups, num_groups=len(where)
-    )
-    old = factor_covariances(before.clusters.covariances, floor)
-    moved = moved_factors(before.raw_scale_tril, old, factor_covariances(pooled.covariances, floor))
+    if native.supports(before.means):
+        tensors = (before.counts, before.means, before.scatters, before.raw_scale_tril)
+        new = (found.counts, found.means, found.scatters)
+        *moments, shift, moved = torch.ops.lardhm.pool(*tensors, *new, floor)
+        pooled = Clusters(*moments)
+    else:
+        pooled, shift, moved = _pooled(before, found, floor)
     after = replace(
         before,
-        centers=before.centers + (pooled.means - before.means),
+        centers=before.centers + shift,
         raw_scale_tril=moved,
         counts=pooled.counts,
         means=pooled.means,
         scatters=pooled.scatters,
     )
     return known.put(where, after)
+
+
+def _pooled(known: MapState, found: Clusters, floor: float) -> tuple[Clusters, Tensor, Tensor]:
+    """Pooled clusters, how far their means moved, and the moved factors: the definition."""
+    groups = torch.arange(len(known), device=known.counts.device).repeat(2)
+    both = concatenate_clusters([known.clusters, found])
+    pooled = pool_clusters(both, groups, num_groups=len(known))
+    old, new = (factor_covariances(c.covariances, floor) for c in (known.clusters, pooled))
+    return pooled, pooled.means - known.means, moved_factors(known.raw_scale_tril, old, new)
 
 
 def moved_factors(raw_scale_tril: Tensor, before: Tensor, after: Tensor) -> Tensor:

@@ -7,21 +7,19 @@ held to be true there; points drawn from the moments, labelled by the map, stand
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import factor_covariances, z_order
-from lardhm_torch.features import Kernel, raw_factors
+from lardhm_torch.clustering import MIN_COUNT, factor_covariances, z_order
+from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
+from lardhm_torch.native.update import explain, ordered_features
 
-# Free points within four standard deviations of an occupied cluster (a kernel value of 0.0003)
-# contradict it, if they are so many: single ones come from noise in range and pose.
-INSIDE = 0.000335
-MIN_PASSES = 2
+INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
+KEPT = 0.25  # of a contradicted cluster's past
 
 
 @dataclass(frozen=True)
@@ -42,25 +40,37 @@ class Evidence:
         return len(self.points)
 
 
-def new_evidence(points: Tensor, labels: Tensor, limit: int, rng: torch.Generator) -> Evidence:
-    """New points, or ``limit`` of them at random that count for all, as many of each class.
+def spread_rows(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
+    """(count, D) of the points, one from each of as many equal stretches; all if there are no more.
+
+    Points of one ray follow each other, so that all rays get their share.
+    """
+    if count >= len(points):
+        return points
+    place = torch.rand(count, generator=rng, device=rng.device, dtype=torch.float64)
+    place += torch.arange(count, device=rng.device)
+    rows = (place * (len(points) / count)).long().clamp_(max=len(points) - 1)
+    return points.index_select(0, rows)
+
+
+def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> list[Evidence]:
+    """New points of each class, or ``limit`` of them that count for all, as many of each class.
 
     Both classes have the same total in the loss, so that an equal number of each says most.
+
+    Args:
+        classes: (N, D) occupied and (N, D) free points [m].
+        limit: how many points at most.
+        rng: random state.
     """
-    is_occupied = labels > 0.5
-    if len(points) <= limit:
-        return Evidence(points, labels, is_occupied, torch.ones_like(labels))
-    classes = [is_occupied.nonzero().squeeze(1), (~is_occupied).nonzero().squeeze(1)]
     parts = []
-    for rows, other in (classes, classes[::-1]):
-        drawn = max(limit // 2, limit - len(other))
-        counts = max(1.0, len(rows) / drawn)
-        if len(rows) > drawn:
-            # with repetition: a permutation of a million points takes longer than the training
-            rows = rows[torch.randint(len(rows), (drawn,), generator=rng, device=rng.device)]
-        parts.append((rows, torch.full_like(labels[rows], counts)))
-    rows, strength = (torch.cat(columns) for columns in zip(*parts, strict=True))
-    return Evidence(points[rows], labels[rows], is_occupied[rows], strength)
+    for number, label in enumerate((1.0, 0.0)):
+        members, other = classes[number], classes[1 - number]
+        points = spread_rows(members, max(limit // 2, limit - len(other)), rng)
+        labels = points.new_full((len(points),), label)
+        strength = torch.full_like(labels, len(members) / max(1, len(points)))
+        parts.append(Evidence(points, labels, labels > 0.5, strength))
+    return parts
 
 
 def recalled_evidence(
@@ -83,85 +93,96 @@ def recalled_evidence(
     return Evidence(points, labels, is_occupied.reshape(-1), strength.reshape(-1))
 
 
-def remembered_strength(known: MapState, new: Evidence, memory: float, floor: float) -> Tensor:
-    """(M,) how many points the past of each cluster counts.
+def contradicted(
+    known: MapState, classes: list[Tensor], limit: int, floor: float, rng: torch.Generator
+) -> Tensor:
+    """(M,) how many points of an occupied cluster's past a scan leaves it; elsewhere infinity.
 
-    As many as it has met, but not more than ``memory``. An occupied cluster that rays now pass
-    through, so that the new points alone would call it free, counts no more than those that say so:
-    old obstacles fade within a few scans however often they were seen.
+    A scan contradicts an occupied cluster if its rays pass through and none ends there. It is then
+    worth no more than the points that say so, however often it was seen before: old obstacles fade.
+
+    Args:
+        known: M clusters.
+        classes: (N, D) occupied and (N, D) free points of the scan [m].
+        limit: how many points of each class are looked at.
+        floor: smallest standard deviation [m].
+        rng: random state of which points are looked at.
     """
-    strength = known.counts.clamp(max=memory).to(known.means.dtype)
+    worth = torch.full_like(known.weights, torch.inf)
     occupied = known.is_occupied.nonzero().squeeze(1)
-    share = float(new.is_occupied.double().mean())
-    if len(occupied) == 0 or not 0 < share < 1:
-        return strength
+    if len(occupied) == 0 or not all(map(len, classes)):
+        return worth
     own = known.rows(occupied)
-    raw = raw_factors(factor_covariances(own.clusters.covariances, floor))
-    index, one = native.build_index(own.means, 1), Kernel(num_neighbors=1)
-    owner, value = native.nearest_features(new.points, own.means, raw, one, index)
-    inside = value.squeeze(1) > INSIDE
-    owner, kinds = owner.squeeze(1)[inside].long(), new.is_occupied[inside]
-    counts = new.strength[inside]
-    hits = torch.zeros_like(own.weights).index_add_(0, owner[kinds], counts[kinds])
-    passes = torch.zeros_like(own.weights).index_add_(0, owner[~kinds], counts[~kinds])
-    worth = passes * share / (1 - share)  # in units of hits, as if both classes had one total
-    held = strength[occupied]
-    denied = (worth > hits) & (passes >= MIN_PASSES)
-    return strength.index_copy(0, occupied, torch.where(denied, held.minimum(worth), held))
+    factors = factor_covariances(own.clusters.covariances, floor)
+    drawn = [spread_rows(points, limit, rng) for points in classes]
+    hits, passes = (explain(part, own.means, factors, INSIDE, INSIDE)[1] for part in drawn)
+    # in units of hits, as if both classes had one total
+    passes *= len(classes[0]) / len(drawn[1])
+    denied = (passes > 0) & (hits == 0)
+    return worth.index_copy_(0, occupied, passes.where(denied, torch.inf))
+
+
+def forget(part: MapState, worth: Tensor, memory: float) -> MapState:
+    """Clusters that a scan contradicts lose most of their past: what is kept is `KEPT` of it.
+
+    Their covariances stay, and their past counts as at most ``memory`` before it is cut. See
+    `contradicted` for what ``worth`` is: (Q,), of the first Q clusters.
+    """
+    worth = torch.cat([worth, worth.new_full((len(part) - len(worth),), torch.inf)])
+    kept = (KEPT * part.counts.clamp(max=memory)).long().clamp(min=MIN_COUNT)
+    counts = torch.where(worth < kept, kept, part.counts).minimum(part.counts)
+    share = (counts - 1).clamp(min=1) / (part.counts - 1).clamp(min=1)
+    return replace(part, counts=counts, scatters=part.scatters * share.to(worth)[:, None, None])
 
 
 def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator) -> Tensor:
     """(M * count, D) points uniform in ellipsoids with the clusters' means and covariances.
 
-    Cells of k-means end where the next begins; a normal distribution would reach far into it.
+    Cells of k-means end where the next begins; a normal distribution would reach far into it. Points
+    come in pairs on opposite sides of the mean and at radii spread evenly: a few stand for a cluster
+    better than as many independent ones.
     """
     clusters = known.clusters
     spread = clusters.scatters / clusters.counts.clamp(min=1)[:, None, None]
     factors = factor_covariances(spread, floor)
     num_clusters, dim = clusters.means.shape
-    shape = (num_clusters, count, dim)
+    pairs = -(-count // 2)
+    shape = (num_clusters, pairs, dim)
     direction = torch.randn(shape, generator=rng, device=rng.device, dtype=factors.dtype)
     direction /= torch.linalg.vector_norm(direction, dim=2, keepdim=True)
-    share = torch.rand(num_clusters, count, 1, generator=rng, device=rng.device).to(factors)
+    share = torch.rand(num_clusters, pairs, 1, generator=rng, device=rng.device).to(factors)
+    share = (share + torch.arange(pairs, device=rng.device)[:, None]) / pairs
     ball = (dim + 2) ** 0.5 * share ** (1 / dim) * direction
+    ball = torch.cat([ball, -ball], dim=1)[:, :count]
     return (clusters.means[:, None] + ball @ factors.mT).reshape(-1, dim)
 
 
-def around(seen: Tensor, state: MapState, num_neighbors: int) -> Tensor:
-    """(M,) bool: clusters that new points see among their nearest, and the nearest of those.
+def around(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
+    """(M,) bool: clusters that new points joined or made, their neighbors, and the next ones.
 
-    The weights of the first are pulled by the new points; what the others know must hold them.
+    The weights of the neighbors, too, are pulled by the new points; what the next ones know must
+    hold them.
     """
-    touched = torch.zeros_like(state.is_occupied)
-    touched[seen.reshape(-1).long()] = True
-    near = native.nearest_centers(state.centers[touched], state.centers, num_neighbors)
-    return touched.index_fill(0, near.reshape(-1), True)
+
+    def neighbors(mask: Tensor) -> Tensor:
+        near = native.nearest_centers(centers[mask], centers, num_neighbors, index)
+        return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
+
+    touched = changed | neighbors(changed)
+    return touched | neighbors(touched & ~changed)
 
 
-class Features(NamedTuple):
-    """(N, K) indices of the nearest clusters of evidence, and the kernel values."""
-
-    indices: Tensor
-    values: Tensor
-
-
-def answer(state: MapState, evidence: Evidence, kernel: Kernel, index: Tensor) -> Features:
-    """What the evidence makes the clusters answer."""
-    tensors = (state.centers, state.raw_scale_tril)
-    return Features(*native.nearest_features(evidence.points, *tensors, kernel, index))
-
-
-def join_evidence(parts: list[Evidence], features: list[Features]) -> tuple[Evidence, Features]:
-    """All points of several, in order, with their features."""
+def join_evidence(parts: list[Evidence]) -> Evidence:
+    """All points of several, in order."""
     names = [field.name for field in fields(Evidence)]
-    evidence = Evidence(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
-    return evidence, Features(*(torch.cat(columns) for columns in zip(*features, strict=True)))
+    return Evidence(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
 def learn(
-    weights: Tensor,
+    state: MapState,
     evidence: Evidence,
-    features: Features,
+    kernel: Kernel,
+    index: Tensor,
     config: FitConfig,
     rng: torch.Generator,
 ) -> Tensor:
@@ -169,13 +190,23 @@ def learn(
 
     The regularizer is spread over all that the evidence stands for, not over the few points that
     carry it: otherwise every scan would pull the weights further to zero.
+
+    Args:
+        state: M clusters and the weights to start from.
+        evidence: N points.
+        kernel: of the map.
+        index: of the centers, see `native.build_index`.
+        config: passes, rates and regularizer.
+        rng: random state.
     """
-    order = z_order(evidence.points)
-    columns = (evidence.labels, evidence.is_occupied, evidence.strength, *features)
-    labels, is_occupied, strength, indices, values = deal_samples(
-        tuple(column.index_select(0, order) for column in columns),
-        config.rows_a_batch(len(evidence)),
-        rng,
+    batch_size = config.rows_a_batch(len(evidence))
+    (order,) = deal_samples((z_order(evidence.points),), batch_size, rng)
+    indices, values = ordered_features(
+        evidence.points, order, state.centers, state.raw_scale_tril, kernel, index
+    )
+    labels, is_occupied, strength = (
+        column.index_select(0, order)
+        for column in (evidence.labels, evidence.is_occupied, evidence.strength)
     )
     total, occupied = strength.sum(), (strength * is_occupied).sum()
     counts = strength * (len(evidence) / total)
@@ -189,4 +220,4 @@ def learn(
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:
         return indices[rows], values[rows]
 
-    return fit_weights(features_of, labels, weights, scaled, factors=counts)
+    return fit_weights(features_of, labels, state.weights, scaled, factors=counts)

@@ -45,6 +45,10 @@ class SamplingConfig:
             )
 
 
+class NoUsableRayError(ValueError):
+    """Scans hold no ray that can be sampled; the message counts the reasons."""
+
+
 @dataclass(frozen=True)
 class Samples:
     """Training pairs, world frame.
@@ -74,8 +78,9 @@ def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str,
         (zero-length rays among them), which lie in the sensor's own body; later returns of a
         pulse, before which space is not free.
     """
-    finite = scans.ends.isfinite().all(dim=1) & scans.ray_origins.isfinite().all(dim=1)
-    inside = finite & ~(scans.ranges >= max(config.min_range, 1e-9))
+    ranges = scans.ranges
+    finite = ranges.isfinite()  # not if a coordinate of either end is not
+    inside = finite & ~(ranges >= max(config.min_range, 1e-9))
     later = finite & ~inside & (scans.target_index > 1)
     counts = {
         "not finite": int((~finite).sum()),
@@ -99,53 +104,67 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
         seed: of the random positions; the same seed gives the same samples.
 
     Raises:
-        ValueError: no ray is usable; the message says why.
+        NoUsableRayError: no ray is usable; a ValueError whose message says why.
 
     Source: Guizilini & Ramos 2016, Section II-A.
     """
     config = config or SamplingConfig()
     keep, dropped = usable_rays(scans, config)
     if not keep.any():
-        raise ValueError(f"scans must hold at least one usable ray of {len(scans)}; got {dropped}")
+        raise NoUsableRayError(
+            f"scans must hold at least one usable ray of {len(scans)}; got {dropped}"
+        )
     rays = keep.nonzero().squeeze(1)
-    origins, ranges = scans.ray_origins[rays], scans.ranges[rays]
-    directions = (scans.ends[rays] - origins) / ranges[:, None]
+    # the starts of a single scan are one point: gathering them for every ray would take longest
+    starts = scans.origins[:1] if scans.num_scans == 1 else scans.ray_origins[rays]
+    offsets = scans.ends[rays] - starts
+    ranges = torch.linalg.vector_norm(offsets, dim=1)
     is_hit = scans.is_return[rays] & (ranges <= config.max_range)
-    first = scans.target_index[rays] == 1
     reach = ranges.clamp(max=config.max_range)
     free_end = torch.where(is_hit, (reach - config.near_margin).clamp(min=0), reach)
+    first = scans.target_index[rays] == 1
     rng = torch.Generator(device=ranges.device).manual_seed(seed)
-    ray, depth = _free_depths(free_end, is_hit & first, config, rng, first)
+    groups = [
+        _stratified_depths(first, free_end, config.free_samples, rng),
+        _near_depths(is_hit & first, free_end, config, rng),
+    ]
     hits = is_hit.nonzero().squeeze(1)
-    # the starts of a single scan are one point: gathering them for every sample takes longest
-    starts = scans.origins[:1] if scans.num_scans == 1 else origins.index_select(0, ray)
-    points = origins.new_empty(len(hits) + len(ray), scans.dim)
-    points[: len(hits)] = scans.ends[rays[hits]]
-    ahead = directions.index_select(0, ray)
-    torch.addcmul(starts, depth[:, None], ahead, out=points[len(hits) :])
-    labels = torch.zeros(len(points), device=points.device)
+    count = len(hits) + sum(depths.numel() for _, depths in groups)
+    points, ray_id = ranges.new_empty(count, scans.dim), hits.new_empty(count)
+    points[: len(hits)], ray_id[: len(hits)] = scans.ends[rays[hits]], rays[hits]
+    begin = len(hits)
+    for members, depths in groups:  # written in place: on a full scan a million points
+        rows = slice(begin, begin := begin + depths.numel())
+        start = starts if scans.num_scans == 1 else starts[members]
+        ahead = offsets[members] / ranges[members, None]
+        block = points[rows].view(*depths.shape, scans.dim)
+        torch.addcmul(start[:, None], depths[:, :, None], ahead[:, None], out=block)
+        ray_id[rows].view_as(depths).copy_(rays[members, None])
+    labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
-    return Samples(points, labels, torch.cat([rays[hits], rays[ray]]), dropped)
+    return Samples(points, labels, ray_id, dropped)
 
 
-def _free_depths(
-    free_end: Tensor, is_hit: Tensor, config: SamplingConfig, rng: torch.Generator, first: Tensor
+def _stratified_depths(
+    rays: Tensor, free_end: Tensor, count: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """(F,) ray number and (F,) depth [m] of every free sample, stratified ones first."""
-    device = free_end.device
-    strata = config.free_samples * first.long()
-    ray = torch.repeat_interleave(strata)
-    before = strata.cumsum(0) - strata
-    # in place: on a full scan every array here is a million samples long
-    depth = torch.rand(len(ray), generator=rng, device=device, dtype=free_end.dtype)
-    depth += torch.arange(len(ray), device=device)
-    depth -= before.index_select(0, ray)
-    depth *= (free_end / strata.clamp(min=1)).index_select(0, ray)
-    near = is_hit.nonzero().squeeze(1).repeat(config.near_samples)
-    share = torch.rand(len(near), generator=rng, device=device, dtype=free_end.dtype)
-    back = share * (config.near_reach - config.near_margin)
-    near_depth = (free_end[near] - back).clamp(min=0)
-    return torch.cat([ray, near]), torch.cat([depth, near_depth])
+    """(Q,) which of the rays, and (Q, count) one depth [m] in each of as many equal stretches."""
+    members = rays.nonzero().squeeze(1)
+    shape = (len(members), count)
+    depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
+    depths += torch.arange(count, device=rng.device)
+    return members, depths.mul_((free_end[members] / count)[:, None])
+
+
+def _near_depths(
+    rays: Tensor, free_end: Tensor, config: SamplingConfig, rng: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """(Q,) which of the rays, and (Q, near_samples) depths [m] close in front of their hits."""
+    members = rays.nonzero().squeeze(1)
+    shape = (len(members), config.near_samples)
+    depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
+    depths *= config.near_margin - config.near_reach
+    return members, depths.add_(free_end[members, None]).clamp_(min=0)
 
 
 def check_samples(

@@ -85,7 +85,8 @@ class Scans:
     @property
     def ranges(self) -> Tensor:
         """(R,) length of each ray [m]."""
-        return torch.linalg.vector_norm(self.ends - self.ray_origins, dim=1)
+        starts = self.origins if self.num_scans == 1 else self.ray_origins
+        return torch.linalg.vector_norm(self.ends - starts, dim=1)
 
     @property
     def hits(self) -> Tensor:

@@ -19,6 +19,7 @@ from lardhm_torch.clustering import cluster_points, factor_covariances
 from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState
 from lardhm_torch.merging import match_clusters, merge_clusters
+from lardhm_torch.replay import contradicted, forget
 
 F64 = torch.float64
 PAPER = UpdateConfig(as_in_paper=True, replay=0)
@@ -180,6 +181,30 @@ def test_parameters_stay_the_same_objects_and_old_clusters_keep_their_rows():
     torch.testing.assert_close(model.centers[: len(occupied)], wall_map().centers)
 
 
+def test_a_map_that_grows_keeps_a_reserve_that_no_file_and_no_copy_holds(tmp_path):
+    model = wall_map().update(*wall(at=6.0), num_clusters=40)
+    place, size = model.centers.data_ptr(), len(model)
+    assert model.centers.untyped_storage().nbytes() > model.centers.nbytes
+    model.update(*wall(60, at=12.0, seed=1), num_clusters=4)
+    assert len(model) > size
+    assert model.centers.data_ptr() == place  # it grew in its reserve
+    copied = copy.deepcopy(model).update(*wall(60, at=18.0), num_clusters=4)
+    assert copied.centers.data_ptr() != place
+    assert same_map(copied, copy.deepcopy(model).update(*wall(60, at=18.0), num_clusters=4))
+    model.save(tmp_path / "map.pt")
+    loaded = torch.load(tmp_path / "map.pt", weights_only=True)
+    tensors = [value for value in loaded.values() if isinstance(value, torch.Tensor)]
+    assert all(tensor.untyped_storage().nbytes() == tensor.nbytes for tensor in tensors)
+    assert same_map(LardHilbertMap.load(tmp_path / "map.pt"), model)
+
+
+def test_growth_leaves_alone_the_memory_behind_a_tensor_that_was_handed_in():
+    model, whole = wall_map(), torch.arange(10_000)
+    model.counts = whole[: len(model)]
+    model.update(*wall(at=6.0), num_clusters=40)
+    assert torch.equal(whole[len(wall_map()) :], torch.arange(10_000)[len(wall_map()) :])
+
+
 def test_plain_sgd_goes_on_after_growth_and_adam_fails_loudly_until_its_state_is_resized():
     model = wall_map()
     points, labels = wall(seed=2)
@@ -244,17 +269,16 @@ def test_an_interrupt_while_the_result_is_taken_over_leaves_the_map_as_it_was(mo
     from lardhm_torch import map_state
 
     model = wall_map()
-    before, assign = copy.deepcopy(model), map_state.assign_state
+    before, assign = copy.deepcopy(model), map_state.assign_rows
 
-    def interrupted(target, state):
-        monkeypatch.setattr(map_state, "assign_state", assign)
-        map_state.resize(target, len(state))
+    def interrupted(target, where, part):
+        monkeypatch.setattr(map_state, "assign_rows", assign)
         with torch.no_grad():
-            target.weights.copy_(state.weights)
-            target.centers.copy_(state.centers)
+            target.weights[where] = part.weights[: len(where)]
+            target.centers[len(before) :] = part.centers[len(where) :]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(map_state, "assign_state", interrupted)
+    monkeypatch.setattr(map_state, "assign_rows", interrupted)
     with pytest.raises(KeyboardInterrupt):
         model.update(*wall(at=at, seed=1), seed=1)
     assert same_map(model, before)
@@ -350,6 +374,32 @@ def test_an_obstacle_that_rays_pass_through_fades_within_a_few_scans():
         scans += 1
     assert scans >= 1
     assert (model(beyond[:600]) > 0.5).double().mean() > 0.9
+
+
+def test_a_contradicted_cluster_forgets_most_of_its_past_and_keeps_its_shape():
+    points = wall()[0]
+    clusters = cluster_points(points[:600], 4, torch.Generator().manual_seed(0))
+    part = state_of(clusters, torch.ones(len(clusters), dtype=torch.bool))
+    worth = torch.full_like(part.weights, torch.inf)
+    worth[0] = 0.5
+    after = forget(part, worth, memory=80.0)
+    assert torch.equal(after.counts[1:], part.counts[1:])
+    assert after.counts[0] == 20
+    torch.testing.assert_close(after.clusters.covariances, part.clusters.covariances)
+
+
+def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
+    points = wall()[0]
+    rng = torch.Generator().manual_seed(0)
+    clusters = cluster_points(points[:600], 8, rng)
+    known = state_of(clusters, torch.arange(len(clusters)) % 2 > 0)
+    hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
+    worth = contradicted(known, [hits, free], 10_000, 0.01, rng)
+    assert torch.equal(worth.isfinite(), known.is_occupied)
+    as_often = contradicted(known, [free, free], 10_000, 0.01, rng)
+    assert not as_often.isfinite().any()
+    nothing = contradicted(known, [hits[:0], free], 10_000, 0.01, rng)
+    assert not nothing.isfinite().any()
 
 
 # --- real scans ---

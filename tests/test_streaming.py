@@ -166,7 +166,19 @@ def test_the_real_time_setting_learns_the_same_room_with_fewer_points(folder, wh
     assert fast["balanced_accuracy"] > full["balanced_accuracy"] - 0.02
 
 
-@pytest.mark.parametrize("name", ["num_clusters", "max_rays", "radius", "checkpoint_every"])
+def test_a_limit_of_clusters_holds_for_every_scan_and_changes_nothing_below_it(folder, whole):
+    first = list(iter_scans(folder))[:1]
+    limited, free, high = LardHilbertMap(), LardHilbertMap(), LardHilbertMap()
+    stream_scans(limited, first, StreamConfig(max_clusters=40))
+    stream_scans(free, first)
+    stream_scans(high, first, StreamConfig(max_clusters=100_000))
+    assert len(limited) <= 40 < len(free)
+    assert same_map(high, free)
+
+
+@pytest.mark.parametrize(
+    "name", ["num_clusters", "max_clusters", "max_rays", "radius", "checkpoint_every"]
+)
 def test_settings_are_checked_when_made(name):
     with pytest.raises(ValueError, match=f"{name} must be > 0; got 0"):
         StreamConfig(**{name: 0})

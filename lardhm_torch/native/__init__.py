@@ -250,6 +250,27 @@ def _register() -> None:
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
         return tuple(torch.empty_like(weights) for _ in range(3))
 
+    @library.register_fake("lardhm::explain")
+    def _(points: Tensor, centers: Tensor, *_: Any) -> tuple[Tensor, ...]:
+        count, dim = centers.shape
+        owners = points.new_empty(points.shape[0], dtype=torch.int32)
+        sizes = [(count, *[dim] * power) for power in range(3)]
+        return owners, *(centers.new_empty(size) for size in sizes)
+
+    @library.register_fake("lardhm::reaching")
+    def _(centers: Tensor, *_: Any) -> Tensor:
+        return centers.new_empty(centers.shape[0], dtype=torch.bool)
+
+    @library.register_fake("lardhm::ordered_features")
+    def _(points: Tensor, order: Tensor, centers: Tensor, raw: Tensor, index: Tensor, k: int,
+          *_: Any) -> tuple[Tensor, Tensor]:  # fmt: skip
+        shape = (points.shape[0], min(k, centers.shape[0]))
+        return points.new_empty(shape, dtype=torch.int32), points.new_empty(shape)
+
+    @library.register_fake("lardhm::pool")
+    def _(counts: Tensor, means: Tensor, scatters: Tensor, raw: Tensor, *_: Any) -> Any:
+        return tuple(torch.empty_like(t) for t in (counts, means, scatters, means, raw))
+
     library.register_autograd("lardhm::occupancy", _backward, setup_context=_keep_inputs)
 
 

@@ -1,0 +1,158 @@
+// Clusters pooled with the moments of new points, and factors moved by the change.
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <tuple>
+
+#include "tensors.h"
+
+namespace lardhm {
+namespace {
+
+// Lower triangles, D rows of D; what is above the diagonal is never read.
+template <int D>
+using Matrix = double[D][D];
+
+// As `clustering.factor_covariances`: of scatter / (count - 1) with a ridge.
+template <int D>
+void factor(const double* scatter, double count, double floor, Matrix<D> lower) {
+  const double share = 1 / std::max(count - 1, 1.0);
+  double largest = scatter[0] * share;
+  for (int d = 1; d < D; ++d) largest = std::max(largest, scatter[d * D + d] * share);
+  const double ridge = floor * floor + 1e-6 * largest;
+  for (int i = 0; i < D; ++i)
+    for (int j = 0; j <= i; ++j) {
+      double sum = scatter[i * D + j] * share + (i == j ? ridge : 0);
+      for (int m = 0; m < j; ++m) sum -= lower[i][m] * lower[j][m];
+      lower[i][j] = i == j ? std::sqrt(sum) : sum / lower[j][j];
+    }
+}
+
+// inv(before) raw-factor, in place of the factor: forward substitution, column by column.
+template <int D>
+void solve(const Matrix<D> before, Matrix<D> factors) {
+  for (int column = 0; column < D; ++column)
+    for (int i = column; i < D; ++i) {
+      double rest = factors[i][column];
+      for (int j = column; j < i; ++j) rest -= before[i][j] * factors[j][column];
+      factors[i][column] = rest / before[i][i];
+    }
+}
+
+// One cluster: the moments of the union, the center and the factor moved as they moved.
+template <class T, int D>
+struct Pooled {
+  double count, mean[D], shift[D], scatter[D * D];
+
+  Pooled(int64_t known, const T* mean_a, const T* scatter_a, int64_t found, const T* mean_b,
+         const T* scatter_b) {
+    count = double(known + found);
+    const double share = double(found) / std::max(count, 1.0), weight = double(known) * share;
+    double apart[D];
+    for (int d = 0; d < D; ++d) {
+      apart[d] = double(mean_b[d]) - double(mean_a[d]);
+      shift[d] = share * apart[d];
+      mean[d] = double(mean_a[d]) + shift[d];
+    }
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j < D; ++j)
+        scatter[i * D + j] = double(scatter_a[i * D + j]) + double(scatter_b[i * D + j]) +
+                             weight * apart[i] * apart[j];
+  }
+
+  // False where a covariance is not positive definite.
+  bool move(const T* scatter_before, int64_t known, double floor, const T* raw, T* to) const {
+    double before_scatter[D * D];
+    for (int i = 0; i < D * D; ++i) before_scatter[i] = double(scatter_before[i]);
+    Matrix<D> before, after, tuned;
+    factor<D>(before_scatter, double(known), floor, before);
+    factor<D>(scatter, count, floor, after);
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j)
+        tuned[i][j] = i == j ? std::exp(double(raw[i * D + i])) : double(raw[i * D + j]);
+    solve<D>(before, tuned);
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j < D; ++j) {
+        double sum = 0;
+        for (int m = j; m <= i; ++m) sum += after[i][m] * tuned[m][j];
+        to[i * D + j] = T(i == j ? std::log(sum) : sum);
+      }
+    double product = 1;
+    for (int d = 0; d < D; ++d) product *= after[d][d] * before[d][d];
+    return product > 0;
+  }
+};
+
+using Clusters = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+void check_moments(const Tensor& counts, const Tensor& means, const Tensor& scatters,
+                   const Tensor& like) {
+  const int64_t size = like.size(0), dim = like.size(1);
+  STD_TORCH_CHECK(counts.scalar_type() == ScalarType::Long && counts.numel() == size &&
+                      means.dim() == 2 && means.size(0) == size && means.size(1) == dim &&
+                      scatters.numel() == size * dim * dim &&
+                      means.scalar_type() == like.scalar_type() &&
+                      scatters.scalar_type() == like.scalar_type(),
+                  "counts (M,) int64, means (M, D) and scatters (M, D, D) must be of one size");
+}
+
+// (counts, means, scatters, how far the means moved, raw factors) of the clusters of both.
+Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tensor& given_scatters,
+              const Tensor& given_raw, const Tensor& found_counts, const Tensor& found_means,
+              const Tensor& found_scatters, double floor) {
+  const Tensor counts = tidy(given_counts), means = tidy(given_means);
+  const Tensor scatters = tidy(given_scatters), raw = tidy(given_raw);
+  const Tensor new_counts = tidy(found_counts), new_means = tidy(found_means);
+  const Tensor new_scatters = tidy(found_scatters);
+  check_moments(counts, means, scatters, means);
+  check_moments(new_counts, new_means, new_scatters, means);
+  check_moments(counts, means, raw, means);
+  const Clusters result{torch::stable::new_empty(counts, counts.sizes()),
+                        torch::stable::new_empty(means, means.sizes()),
+                        torch::stable::new_empty(scatters, scatters.sizes()),
+                        torch::stable::new_empty(means, means.sizes()),
+                        torch::stable::new_empty(raw, raw.sizes())};
+  dispatch(means, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    constexpr int64_t kGrain = 512;
+    const int64_t size = means.size(0);
+    std::atomic<bool> definite{true};
+    run_tasks((size + kGrain - 1) / kGrain, [&](int64_t task) {
+      for (int64_t m = task * kGrain; m < std::min(size, (task + 1) * kGrain); ++m) {
+        const int64_t known = in<int64_t>(counts)[m], found = in<int64_t>(new_counts)[m];
+        const T* before = in<T>(scatters) + m * D * D;
+        const Pooled<T, D> pooled(known, in<T>(means) + m * D, before, found,
+                                  in<T>(new_means) + m * D, in<T>(new_scatters) + m * D * D);
+        out<int64_t>(std::get<0>(result))[m] = known + found;
+        for (int d = 0; d < D; ++d) {
+          out<T>(std::get<1>(result))[m * D + d] = T(pooled.mean[d]);
+          out<T>(std::get<3>(result))[m * D + d] = T(pooled.shift[d]);
+        }
+        for (int i = 0; i < D * D; ++i)
+          out<T>(std::get<2>(result))[m * D * D + i] = T(pooled.scatter[i]);
+        if (!pooled.move(before, known, floor, in<T>(raw) + m * D * D,
+                         out<T>(std::get<4>(result)) + m * D * D))
+          definite = false;
+      }
+    });
+    STD_TORCH_CHECK(definite, "a pooled covariance is not positive definite");
+    return 0;
+  });
+  return result;
+}
+
+}  // namespace
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def(
+      "pool(Tensor counts, Tensor means, Tensor scatters, Tensor raw_scale_tril, Tensor new_counts, "
+      "Tensor new_means, Tensor new_scatters, float floor) "
+      "-> (Tensor, Tensor, Tensor, Tensor, Tensor)");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) { m.impl("pool", TORCH_BOX(&lardhm::pool)); }

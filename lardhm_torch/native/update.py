@@ -1,0 +1,100 @@
+"""What an update asks of many clusters or points at once: the definition, and its native twin."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import features, native
+from lardhm_torch.features import Kernel
+
+
+def reaching(
+    centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, points: Tensor, stds: float
+) -> Tensor:
+    """Which kernels reach into the box around points: along every axis, some standard deviations far.
+
+    Args:
+        centers: (M, D) cluster centers [m].
+        raw_scale_tril: (M, D, D) factors with the logarithm of their diagonals.
+        kernel: covariance scale and floor.
+        points: (N, D) positions [m], at least one, finite.
+        stds: how far a kernel is taken to reach, in its own standard deviations.
+
+    Returns:
+        (M,) bool.
+    """
+    if native.supports(centers):
+        given = (t.detach() for t in (centers, raw_scale_tril, points))
+        return torch.ops.lardhm.reaching(*given, stds, *kernel[1:])
+    lower, upper = points.aminmax(dim=0)
+    factors = features.kernel_factors(raw_scale_tril, kernel)
+    reach = stds * torch.linalg.vector_norm(factors, dim=2)
+    return ((centers + reach >= lower) & (centers - reach <= upper)).all(dim=1)
+
+
+def explain(
+    points: Tensor, centers: Tensor, scale_tril: Tensor, radius: float, reach: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Every point to its nearest center, if that is near enough, and the moments of the nearest.
+
+    Distances to decide whether it is near enough are in standard deviations of the cluster.
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m], at least one.
+        scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
+        radius: nearer points count in the moments.
+        reach: nearer points have an owner; not less than ``radius``.
+
+    Returns:
+        (N,) int owners, M for a point without one; (M,) counts; (M, D) sums of the offsets from
+        the own center [m]; (M, D, D) sums of their outer products [m^2]. Sums are taken in float64.
+    """
+    if native.supports(points):
+        raw = features.raw_factors(scale_tril)
+        return torch.ops.lardhm.explain(points.detach(), centers, raw, radius, reach)
+    count, dim = centers.shape
+    owners = torch.full((len(points),), count, device=points.device)
+    moments = [centers.new_zeros(count, *[dim] * power, dtype=torch.float64) for power in range(3)]
+    for rows in torch.arange(len(points), device=points.device).split(features.QUERY_CHUNK):
+        chunk = points[rows]
+        owner = features.nearest_centers(chunk, centers, 1).squeeze(1)
+        offsets = (chunk - centers[owner])[:, :, None]
+        whitened = torch.linalg.solve_triangular(scale_tril[owner], offsets, upper=False)
+        squared = whitened.square().sum(dim=(1, 2))
+        owners[rows[squared <= reach**2]] = owner[squared <= reach**2]
+        joins = squared <= radius**2
+        owner, offset = owner[joins], offsets[joins, :, 0].double()
+        moments[0].index_add_(0, owner, torch.ones_like(offset[:, 0]))
+        moments[1].index_add_(0, owner, offset)
+        moments[2].index_add_(0, owner, offset[:, :, None] * offset[:, None])
+    counts, sums, scatters = (moment.to(centers.dtype) for moment in moments)
+    return owners, counts, sums, scatters
+
+
+def ordered_features(
+    points: Tensor,
+    order: Tensor,
+    centers: Tensor,
+    raw_scale_tril: Tensor,
+    kernel: Kernel,
+    index: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """`native.nearest_features` of ``points[order]``, searched in the order of the points.
+
+    Neighbors that follow each other are found faster than those far apart, as in batches.
+
+    Args:
+        points: (N, D) positions [m].
+        order: (N,) every row once.
+        centers: (M, D) cluster centers [m].
+        raw_scale_tril: (M, D, D) factors with the logarithm of their diagonals.
+        kernel: k, covariance scale and floor.
+        index: of the centers, see `native.build_index`.
+    """
+    if native.supports(points):
+        given = (points, order, centers, raw_scale_tril, index)
+        return torch.ops.lardhm.ordered_features(*(t.detach() for t in given), *kernel)
+    ordered = points.index_select(0, order)
+    return native.nearest_features(ordered, centers, raw_scale_tril, kernel, index)
