@@ -57,6 +57,8 @@ def run_command(line, monkeypatch):
         run_command(f"{line} --export page.html --resolution 0.3", monkeypatch)
     elif words[0] == "lardhm":
         assert cli.main(words[1:]) == 0, line
+    elif words[0] == "torchrun":  # with two ranks it is run in test_tiles_fitting.py
+        assert cli.main(words[words.index("lardhm_torch.cli") + 1 :]) == 0, line
     else:
         raise AssertionError(f"no rule to check {line!r}")
 

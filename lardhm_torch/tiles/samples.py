@@ -195,7 +195,9 @@ def unpack(
     records: Records, device: torch.device, dtype: torch.dtype, shift: Any = 0.0
 ) -> TilePoints:
     """Records as tensors, the points moved by (D,) [m]."""
-    points = torch.from_numpy(records["position"] + np.asarray(shift, dtype=np.float32))
+    positions = records["position"].copy()  # aligned: sums of records as they are take far longer
+    positions += np.asarray(shift, dtype=np.float32)
+    points = torch.from_numpy(positions)
     kind = torch.from_numpy(records["kind"].copy()).to(device)
     labels = (kind & OCCUPIED).to(dtype)
     return TilePoints(points.to(device, dtype), labels, (kind & HALO) == 0)
