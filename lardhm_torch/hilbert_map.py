@@ -209,6 +209,22 @@ class LardHilbertMap(nn.Module):
             local, *state, probability=probability, index=self._fresh_index()
         )
 
+    @torch.no_grad()
+    def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
+        """`rays.raycast` by the native kernel; None where that does not answer for this map.
+
+        Args:
+            origins: (R, D) world positions, float64 [m].
+            directions: (R, D) of length 1, float64.
+            march: as for `native.raycast`.
+        """
+        if len(self) == 0 or not native.supports(self.centers):
+            return None
+        parameters = (self.centers, self.raw_scale_tril, self.weights)
+        return native.raycast(
+            (origins - self.origin, directions), march, parameters, self.kernel, self._fresh_index()
+        )
+
     def _fresh_index(self) -> Tensor:
         """The neighbor search's index, made anew whenever the centers are not those it was made of."""
         if torch.compiler.is_compiling():  # no branch on values; the operators check it themselves

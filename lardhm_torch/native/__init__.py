@@ -117,6 +117,27 @@ def lattice_occupancy(
     return torch.cat(slabs)
 
 
+def raycast(
+    rays: tuple[Tensor, Tensor],
+    march: tuple[float, float, float, float, bool],
+    parameters: tuple[Tensor, Tensor, Tensor],
+    kernel: Kernel,
+    index: Tensor,
+) -> Tensor:
+    """As `rays.raycast`, for a map that `supports` says yes to.
+
+    Args:
+        rays: (R, D) origins in the map's frame and (R, D) directions of length 1, float64 [m].
+        march: step and largest range [m], log-odds of the threshold and of a clear obstacle, and
+            whether to go on to the ridge.
+        parameters: centers, raw factors, weights of the map.
+        kernel: its settings.
+        index: of the centers.
+    """
+    origins, directions = rays
+    return torch.ops.lardhm.raycast(origins, directions, *march, *parameters, *kernel, index)
+
+
 def nearest_features(
     points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -195,6 +216,10 @@ def _register() -> None:
     @library.register_fake("lardhm::lattice_occupancy")
     def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:
         return axes.new_empty(shape)
+
+    @library.register_fake("lardhm::raycast")
+    def _(origins: Tensor, *_: Any) -> Tensor:
+        return origins.new_empty(origins.shape[0])
 
     @library.register_fake("lardhm::occupancy_backward")
     def _(grad: Tensor, points: Tensor, centers: Tensor, raw: Tensor, weights: Tensor,

@@ -83,6 +83,7 @@ struct Engine {
 
   Index index;
   const T* points;
+  const T* slack = nullptr;  // [m] by point: centers this much farther than the k-th are shown, too
   Parameters<T, D>& parameters;
   const T* positions;
   int k;
@@ -196,6 +197,11 @@ struct Engine {
     }
     const typename Simd<T>::Int most = k;
     if ((bits_le<I>(count, most - I{}) & all) != all) break_ties(packet.lanes, limit, n, s);
+    keep_selected(n, s);
+  }
+
+  // Of the n listed centers, those that s.bits gives to some lane.
+  static void keep_selected(int64_t n, Scratch<T, D>& s) {
     s.selected.size = 0;
     for (int64_t i = 0; i < n; i += kWide) {
       uint32_t some = ~bits_le<WideInt>(load<WideInt>(s.bits.data() + i), WideInt{});
@@ -279,7 +285,7 @@ struct Engine {
 
   // Selects among the centers within a radius of the packet: a guess from the packet before. Where
   // the k-th distance turns out larger, that distance is the radius of the second attempt.
-  void search(const Packet<T, D>& packet, const Region<D>& region, Scratch<T, D>& s) const {
+  void search(Packet<T, D>& packet, const Region<D>& region, Scratch<T, D>& s) const {
     float radius = std::max(s.radius, smallest_radius);
     for (;;) {
       if (radius > s.near_radius) look_farther(1.3f * radius, s);
@@ -292,10 +298,31 @@ struct Engine {
       const float farthest = std::sqrt(float(-smallest_lane<T>(-(V)limit))) * 1.00001f;
       if (farthest <= radius) {
         s.radius = farthest * 1.15f;
-        return select(packet, limit, n, s);
+        packet.farthest = (V)limit;
+        return slack ? select_farther(packet, region, s) : select(packet, limit, n, s);
       }
       radius = farthest;
     }
+  }
+
+  // Fills s.selected with the centers up to each lane's slack farther than its k-th.
+  void select_farther(const Packet<T, D>& packet, const Region<D>& region, Scratch<T, D>& s) const {
+    T limit[W], farthest[W];
+    std::memcpy(farthest, &packet.farthest, sizeof(farthest));
+    T most = 0;
+    for (int lane = 0; lane < W; ++lane) {
+      const int used = std::min(lane, packet.lanes - 1);
+      limit[lane] = (std::sqrt(farthest[lane]) + slack[packet.row(used)]) * T(1.00001);
+      most = std::max(most, limit[lane]);
+      limit[lane] *= limit[lane];
+    }
+    if (float(most) > s.near_radius) look_farther(1.3f * float(most), s);
+    const int64_t n = s.near.pick(region, float(most) * 1.00001f, s.list.data());
+    kth(packet, positions, s.list.data(), n, k, s.distance.data);
+    const uint32_t all = ~0u >> (32 - packet.lanes);
+    for (int64_t i = 0; i < n; ++i)
+      s.bits[i] = bits_le<I>(s.distance.data[i], load<I>(limit)) & all;
+    keep_selected(n, s);
   }
 
   // Fills s.near with the centers within the radius of the group, and s.far, of the region.

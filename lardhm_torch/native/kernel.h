@@ -8,15 +8,23 @@
 
 namespace lardhm {
 
+// Whitened offset inv(L) offset.
+template <class T, int D>
+inline void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
+                          typename Simd<T>::V* z) {
+  const T* below = shape + Layout<D>::below;
+  z[0] = offset[0] * shape[0];
+  z[1] = (offset[1] - z[0] * below[0]) * shape[1];
+  if constexpr (D == 3) z[2] = (offset[2] - z[0] * below[1] - z[1] * below[2]) * shape[2];
+}
+
 // Whitened offset z = inv(L) (x - c) of a packet from one cluster.
 template <class T, int D>
 inline void whiten(const Packet<T, D>& packet, const T* center, const T* shape,
                    typename Simd<T>::V* z) {
-  const T* below = shape + Layout<D>::below;
-  z[0] = (packet.x[0] - center[0]) * shape[0];
-  z[1] = ((packet.x[1] - center[1]) - z[0] * below[0]) * shape[1];
-  if constexpr (D == 3)
-    z[2] = ((packet.x[2] - center[2]) - z[0] * below[1] - z[1] * below[2]) * shape[2];
+  typename Simd<T>::V offset[D];
+  for (int d = 0; d < D; ++d) offset[d] = packet.x[d] - center[d];
+  whiten_offset<T, D>(offset, shape, z);
 }
 
 template <class T, int D>

@@ -12,6 +12,7 @@ namespace lardhm {
 template <class T, int D>
 struct Packet {
   typename Simd<T>::V x[D];
+  typename Simd<T>::V farthest;  // squared distance of the k-th center [m^2], once it is known
   int64_t begin;
   const int32_t* order;
   int lanes;
