@@ -127,11 +127,11 @@ def ray_step(model: Any, part: Any, max_range: float) -> float:
 def _raycast(model: Any, rays: _Rays, threshold: float, surface: str) -> Tensor:
     origins, directions, step, max_range = rays
     level = math.log(threshold / (1 - threshold))
-    if hasattr(model, "query_rays"):
+    if getattr(model, "query_rays", None) is not None:
         march = (step, max_range, level, level + EVIDENCE, surface == "peak")
-        answer = model.query_rays(origins, directions, march)
-        if answer is not None:
-            return answer
+        ranges = model.query_rays(origins, directions, march)
+        if ranges is not None:
+            return ranges
     maybe = _empty_space(model, level + EVIDENCE, step, max_range, len(directions))
     parts = []
     for part in torch.arange(len(directions), device=directions.device).split(RAYS_AT_ONCE):

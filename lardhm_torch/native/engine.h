@@ -318,7 +318,15 @@ struct Engine {
     }
     if (float(most) > s.near_radius) look_farther(1.3f * float(most), s);
     const int64_t n = s.near.pick(region, float(most) * 1.00001f, s.list.data());
-    kth(packet, positions, s.list.data(), n, k, s.distance.data);
+    for (int64_t i = 0; i < n; ++i) {
+      const T* center = positions + int64_t(s.list[i]) * Layout<D>::position;
+      V squared = {};
+      for (int d = 0; d < D; ++d) {
+        const V offset = packet.x[d] - center[d];
+        squared += offset * offset;
+      }
+      s.distance.data[i] = (I)squared;
+    }
     const uint32_t all = ~0u >> (32 - packet.lanes);
     for (int64_t i = 0; i < n; ++i)
       s.bits[i] = bits_le<I>(s.distance.data[i], load<I>(limit)) & all;

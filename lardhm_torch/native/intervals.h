@@ -1,4 +1,4 @@
-// Bounds: a number that the log-odds exceed nowhere on an interval of a ray.
+// Bounds: numbers that the log-odds exceed nowhere on each quarter of an interval of a ray.
 //
 // Let an interval reach h to both sides of its middle, and d be the distance of the middle's k-th
 // center. A cluster is among the k nearest of some point of the interval only if its center is
@@ -18,27 +18,30 @@
 
 namespace lardhm {
 
+constexpr int kQuarters = 4;
+
 // Intervals by their middles (N, D), unit directions (N, D), and half lengths h and 2h [m].
 template <class T, int D>
 struct Intervals {
   std::vector<T> middles, ways, halves, slack;
-  std::vector<T> bounds, nearby;  // what is found: log-odds, and distance of the k-th center [m]
+  std::vector<T> bounds, nearby;  // what is found: (N, 4), and distance of the k-th center (N,) [m]
 
   int64_t size() const { return int64_t(halves.size()); }
 
-  void clear() {
-    middles.clear(), ways.clear(), halves.clear(), slack.clear();
-  }
+  void clear() { middles.clear(), ways.clear(), halves.clear(), slack.clear(); }
 
-  void make_room() { bounds.resize(size()), nearby.resize(size()); }
+  void make_room() { bounds.resize(kQuarters * size()), nearby.resize(size()); }
 };
 
 constexpr double kRounding = 1e-5;  // share and log-odds added to a bound for float32
+constexpr double kSilent = 60;      // squared whitened distance beyond which a cluster adds 1e-13
 
 template <class T, int D>
 struct IntervalVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
+  using I = typename Simd<T>::I;
   using L = Layout<D>;
+  static constexpr int W = Simd<T>::W;
   const T *positions, *shapes;
   Intervals<T, D>& intervals;
 
@@ -47,37 +50,49 @@ struct IntervalVisitor final : Visitor<T, D> {
         intervals(intervals_) {}
 
   void invalid(int64_t row) override {
-    intervals.bounds[row] = -std::numeric_limits<T>::infinity();
+    for (int i = 0; i < kQuarters; ++i)
+      intervals.bounds[row * kQuarters + i] = -std::numeric_limits<T>::infinity();
     intervals.nearby[row] = 0;
   }
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
-    V way[D], half, inner, nearby;
+    V way[D], half, inner, nearby, sum[kQuarters] = {};
     gather(packet, way, half);
-    for (int lane = 0; lane < Simd<T>::W; ++lane) nearby[lane] = std::sqrt(packet.farthest[lane]);
+    for (int lane = 0; lane < W; ++lane) nearby[lane] = std::sqrt(packet.farthest[lane]);
     inner = nearby - 2 * half;  // clusters within it answer all along
     inner = inner > 0 ? inner * inner * T(1 - kRounding) : V{};
-    V sum = {};
     for (int64_t j = 0; j < selected.size; ++j) {
       const T* center = positions + int64_t(selected.rank[j]) * L::position;
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
-      const T weight = shape[L::weight];
-      const auto shown = mask_of<T>(selected.bits[j]);
-      sum += weight > 0 ? largest(packet, way, half, center, shape, shown)
-                        : smallest(packet, way, half, inner, center, shape, shown);
+      const I shown = mask_of<T>(selected.bits[j]);
+      if (shape[L::weight] > 0)
+        add_largest(packet, way, half, center, shape, shown, sum);
+      else
+        add_smallest(packet, way, half, center, shape, shown & within(packet, center, inner), sum);
     }
-    const V size = sum > 0 ? sum : -sum;
-    store_rows<T, D>(sum + size * T(kRounding) + T(kRounding), packet, intervals.bounds.data());
     store_rows<T, D>(nearby, packet, intervals.nearby.data());
+    for (int lane = 0; lane < packet.lanes; ++lane)
+      for (int i = 0; i < kQuarters; ++i)
+        intervals.bounds[packet.row(lane) * kQuarters + i] =
+            sum[i][lane] + std::abs(sum[i][lane]) * T(kRounding) + T(kRounding);
   }
 
  private:
   void gather(const Packet<T, D>& packet, V* way, V& half) const {
-    for (int lane = 0; lane < Simd<T>::W; ++lane) {
+    for (int lane = 0; lane < W; ++lane) {
       const int64_t row = packet.row(std::min(lane, packet.lanes - 1));
       for (int d = 0; d < D; ++d) way[d][lane] = intervals.ways[row * D + d];
       half[lane] = intervals.halves[row];
     }
+  }
+
+  static I within(const Packet<T, D>& packet, const T* center, V squared) {
+    V distance = {};
+    for (int d = 0; d < D; ++d) {
+      const V offset = packet.x[d] - center[d];
+      distance += offset * offset;
+    }
+    return distance < squared;
   }
 
   // z z, z u and u u, with z the whitened offset of the middle and u the whitened direction.
@@ -90,33 +105,41 @@ struct IntervalVisitor final : Visitor<T, D> {
     for (int d = 1; d < D; ++d) zz += z[d] * z[d], zu += z[d] * u[d], uu += u[d] * u[d];
   }
 
-  // The cluster of positive weight where the interval comes closest to it.
-  static V largest(const Packet<T, D>& packet, const V* way, V half, const T* center,
-                   const T* shape, typename Simd<T>::I shown) {
+  // Adds weight exp(-squared / 2) in the lanes that are shown; whether any is worth it.
+  static void add(V squared, T weight, I shown, V& sum) {
+    const I seen = shown & (squared < T(kSilent));
+    if (!bits_of<T>(seen)) return;
+    sum += seen ? exp_of<T>(T(-0.5) * squared) * weight : V{};
+  }
+
+  // A cluster of positive weight, where each quarter comes closest to it.
+  static void add_largest(const Packet<T, D>& packet, const V* way, V half, const T* center,
+                          const T* shape, I shown, V* sum) {
     V zz, zu, uu;
     products(packet, way, center, shape, zz, zu, uu);
-    V at = -zu / uu;
-    at = at < half ? at : half;
-    at = at > -half ? at : -half;
-    const V squared = zz + at * (2 * zu + at * uu) - zz * T(kRounding);
-    return shown ? exp_of<T>(T(-0.5) * at_least(squared)) * shape[Layout<D>::weight] : V{};
-  }
-
-  // The cluster of negative weight at the farther end, where it answers all along.
-  static V smallest(const Packet<T, D>& packet, const V* way, V half, V inner, const T* center,
-                    const T* shape, typename Simd<T>::I shown) {
-    V zz, zu, uu, distance = {};
-    for (int d = 0; d < D; ++d) {
-      const V offset = packet.x[d] - center[d];
-      distance += offset * offset;
+    const V closest = -zu / uu;
+    zz -= zz * T(kRounding);
+    for (int i = 0; i < kQuarters; ++i) {
+      const V low = half * T(i * 2.0 / kQuarters - 1), high = low + half * T(2.0 / kQuarters);
+      V at = closest < high ? closest : high;
+      at = at > low ? at : low;
+      const V squared = zz + at * (2 * zu + at * uu);
+      add(squared > 0 ? squared : V{}, shape[L::weight], shown, sum[i]);
     }
-    const auto always = shown & (distance < inner);
-    products(packet, way, center, shape, zz, zu, uu);
-    const V squared = zz + half * (2 * (zu < 0 ? -zu : zu) + half * uu);
-    return always ? exp_of<T>(T(-0.5) * squared) * shape[Layout<D>::weight] : V{};
   }
 
-  static V at_least(V squared) { return squared > 0 ? squared : V{}; }
+  // A cluster of negative weight, at the farther end of each quarter.
+  static void add_smallest(const Packet<T, D>& packet, const V* way, V half, const T* center,
+                           const T* shape, I shown, V* sum) {
+    if (!bits_of<T>(shown)) return;
+    V zz, zu, uu;
+    products(packet, way, center, shape, zz, zu, uu);
+    for (int i = 0; i < kQuarters; ++i) {
+      const V low = half * T(i * 2.0 / kQuarters - 1), high = low + half * T(2.0 / kQuarters);
+      const V first = zz + low * (2 * zu + low * uu), end = zz + high * (2 * zu + high * uu);
+      add(first > end ? first : end, shape[L::weight], shown, sum[i]);
+    }
+  }
 };
 
 }  // namespace lardhm

@@ -20,8 +20,8 @@ namespace lardhm {
 namespace {
 
 constexpr int kStride = 4;             // steps of the shortest interval, whose log-odds are asked
-constexpr int kFirst = 16;             // steps of the first interval
-constexpr double kShare = 0.75;         // an interval's half length over the distance of the k-th center
+constexpr int kFirst = 32;             // steps of the first interval
+constexpr double kShare = 1;           // most of an interval's half length over the distance of the k-th center
 constexpr int kBisections = 16;        // as in rays.py
 constexpr int kVertices = 2;           // parabolas, each a quarter as wide as the one before
 constexpr double kAhead = 0.1;         // of the longest range, where rays are sorted by place
@@ -55,24 +55,27 @@ struct Ray {
   }
 
   void ask_bound(const March& march, Intervals<T, D>& intervals) const {
-    const double first = march.depth(next), end = march.depth(std::min(next + length, stop) - 1);
-    const double half = 0.5 * (end - first) * (1 + kRounding);
-    place(0.5 * (first + end), intervals.middles);
+    const double first = march.depth(next), half = 0.5 * march.step * double(length - 1);
+    place(first + half, intervals.middles);
     for (int d = 0; d < D; ++d) intervals.ways.push_back(T(way[d]));
-    intervals.halves.push_back(T(half));
-    intervals.slack.push_back(T(2 * half));
+    intervals.halves.push_back(T(half * (1 + kRounding)));
+    intervals.slack.push_back(T(2 * half * (1 + kRounding)));
   }
 
-  void take_bound(const March& march, double bound, double nearby) {
-    if (bound <= march.target) {
-      next += length;
+  // Past the quarters in which there is no obstacle.
+  void take_bound(const March& march, const T* bounds, double nearby) {
+    int passed = 0;
+    while (passed < kQuarters && bounds[passed] <= march.target) ++passed;
+    next += passed * length / kQuarters;
+    if (next >= stop) {
+      phase = Phase::done;
+    } else if (passed == kQuarters) {
       const double most = std::min(2 * kShare * nearby / march.step, 1e9);
-      length = std::max<int64_t>(kStride, std::min<int64_t>(2 * length, int64_t(most)));
-      if (next >= stop) phase = Phase::done;
-    } else if (length <= kStride) {
+      length = std::clamp<int64_t>(int64_t(most) / kQuarters * kQuarters, kQuarters, 2 * length);
+    } else if (length == kQuarters) {
       phase = Phase::search;
     } else {
-      length = std::max<int64_t>(kStride, length / 4);
+      length = std::max<int64_t>(kQuarters, length / kQuarters / kQuarters * kQuarters);
     }
   }
 
@@ -257,7 +260,8 @@ struct Wave {
     const T* value = values.data();
     for (Ray<T, D>& ray : rays) {
       if (ray.phase == Phase::skip) {
-        ray.take_bound(march, intervals.bounds[interval], intervals.nearby[interval]);
+        ray.take_bound(march, intervals.bounds.data() + interval * kQuarters,
+                       intervals.nearby[interval]);
         ++interval;
       } else {
         value += ray.take(march, value);

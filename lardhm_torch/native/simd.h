@@ -86,6 +86,12 @@ inline uint32_t bits_le(I a, I b) {
   return bits;
 }
 
+// One bit a lane, set where the lane of a comparison's result is.
+template <class T>
+inline uint32_t bits_of(typename Simd<T>::I mask) {
+  return bits_le<typename Simd<T>::I>(mask, typename Simd<T>::I{} - 1);
+}
+
 // All bits of a lane set where the lane's bit is.
 template <class T>
 inline typename Simd<T>::I mask_of(uint32_t bits) {
@@ -139,7 +145,7 @@ struct ExpConstants<double> {
 // exp(x) for x <= `highest`: 2^n times the Taylor series of the rest, |rest| <= ln(2) / 2; 0 below
 // `lowest`.
 template <class T>
-inline typename Simd<T>::V exp_of(typename Simd<T>::V x) {
+__attribute__((always_inline)) inline typename Simd<T>::V exp_of(typename Simd<T>::V x) {
   using V = typename Simd<T>::V;
   using I = typename Simd<T>::I;
   using C = ExpConstants<T>;

@@ -1,0 +1,79 @@
+"""How many pictures a second the viewer's page draws, in a Chromium without a graphics card.
+
+Usage: python benchmarks/viewing.py [--data DATA] [--set balm_realworld] [--picture PICTURE]
+
+The map of a whole set and all of its points are shown. The view is turned with the mouse for some
+seconds, and the frames of the page are counted; all drawing is done by the processor (SwiftShader).
+"""
+
+import argparse
+import shutil
+import time
+from pathlib import Path
+
+from conditions import conditions, describe
+from playwright.sync_api import Page, sync_playwright
+
+from lardhm_torch import LardHilbertMap, load_scans, sample_rays
+from lardhm_torch.viewer import MapViewer, ViewConfig
+
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SECONDS = 12
+COUNT = """() => { window.frames_drawn = 0;
+    const next = () => { window.frames_drawn++; requestAnimationFrame(next); };
+    requestAnimationFrame(next); }"""
+
+
+def turned(page: Page) -> tuple[float, float]:
+    """Frames a second, and the longest wait for a move of the mouse [s], while the view turns."""
+    page.evaluate("window.frames_drawn = 0")
+    start, longest, step = time.perf_counter(), 0.0, 0
+    page.mouse.move(300, 450)
+    page.mouse.down()
+    while time.perf_counter() - start < SECONDS:
+        before = time.perf_counter()
+        page.mouse.move(300 + 8 * (step % 40), 450)
+        page.evaluate("() => new Promise(requestAnimationFrame)")
+        longest, step = max(longest, time.perf_counter() - before), step + 1
+    page.mouse.up()
+    return page.evaluate("window.frames_drawn") / (time.perf_counter() - start), longest
+
+
+def main() -> None:
+    """Open the page, turn it with all shown, with the points alone, with the surface alone."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--set", default="balm_realworld")
+    parser.add_argument("--picture", type=Path, help="screenshots are written beside it")
+    arguments = parser.parse_args()
+    print(describe(conditions()))
+    scans = load_scans(arguments.data / arguments.set / "scans.npz")
+    samples = sample_rays(scans)
+    model = LardHilbertMap().fit(samples.points, samples.labels)
+    viewer = MapViewer(model, scans, ViewConfig(port=8123))
+    viewer.wait()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), headless=True, args=FLAGS
+        )
+        page = browser.new_page(viewport={"width": 1200, "height": 760})
+        page.set_default_timeout(300_000)
+        page.goto(viewer.url)
+        page.get_by_text("surface of").wait_for()
+        print(page.get_by_text("surface of").text_content())
+        page.wait_for_timeout(8000)
+        page.evaluate(COUNT)
+        for name, label in (("all", None), ("surface", "show points"), ("nothing", "show surface")):
+            if label is not None:
+                page.get_by_label(label).click()
+                page.wait_for_timeout(1500)
+            if arguments.picture is not None:
+                page.screenshot(path=arguments.picture.with_stem(f"{arguments.picture.stem}-{name}"))
+            rate, longest = turned(page)
+            print(f"{name:<10}{rate:>7.1f} frames a second, longest wait {longest:.2f} s", flush=True)
+        browser.close()
+    viewer.close()
+
+
+if __name__ == "__main__":
+    main()
