@@ -31,7 +31,7 @@ SETS = (
 )
 STREET = "kitti00_mulls"
 MAX_RANGE = 80.0  # [m]
-VOXELS = (0.1, 0.2, 0.4)  # [m]
+VOXELS = (0.05, 0.1, 0.2, 0.4)  # [m]
 
 
 def fitted(data: Path, name: str):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lardhm_torch.files import replaced_file
 from lardhm_torch.querying import query_slice
 
 if TYPE_CHECKING:
@@ -83,7 +84,8 @@ def render_mesh(
     if path is not None:
         from matplotlib.image import imsave
 
-        imsave(path, result)
+        with replaced_file(path) as partial:
+            imsave(partial, result)
     return result
 
 
@@ -128,7 +130,8 @@ def render_slice(
     if height is not None:
         axes.set_title(f"z = {height:.2f} m")
     figure.colorbar(image, ax=axes, label="probability of occupancy", shrink=0.8)
-    figure.savefig(path, dpi=130)
+    with replaced_file(path) as partial:
+        figure.savefig(partial, dpi=130)
 
 
 def _check_png(path: str | Path | None) -> None:

@@ -5,7 +5,7 @@ Positions are relative to an ``offset`` near the middle of the map, so that floa
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,8 +14,13 @@ from torch import Tensor
 from lardhm_torch.querying import query_slice
 from lardhm_torch.scans import Scans
 
+if TYPE_CHECKING:
+    import trimesh
+
 SLICE_PIXELS = 512  # along the longer edge
 MESH_FACES = 200_000  # about; the resolution is chosen for it
+SHOWN_FACES = 60_000  # of a surface on the page
+KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light that is painted on
 
 
 def core_box(model: Any, share: float = 0.02, margin: float = 0.5) -> tuple[Tensor, Tensor]:
@@ -79,18 +84,74 @@ def ellipsoids(model: Any, chosen: Tensor, offset: np.ndarray) -> dict[str, Any]
     }
 
 
+def fewer_faces(mesh: trimesh.Trimesh, most: int = SHOWN_FACES) -> trimesh.Trimesh:
+    """The mesh with at most about so many faces, flat parts first; colors of the nearest vertices.
+
+    Source: Garland & Heckbert 1997, quadric error metrics (by fast-simplification).
+    """
+    import trimesh
+    from scipy.spatial import cKDTree
+
+    if len(mesh.faces) <= most:
+        return mesh
+    import fast_simplification
+
+    vertices, faces = fast_simplification.simplify(
+        mesh.vertices.astype(np.float32), mesh.faces, target_count=most
+    )
+    nearest = cKDTree(mesh.vertices).query(vertices)[1]
+    visual: Any = mesh.visual
+    colors = visual.vertex_colors[nearest]
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+
+
+def painted_glb(mesh: trimesh.Trimesh) -> bytes:
+    """The mesh as GLB whose colors hold the light already, so that a page need not compute it.
+
+    Half of the light comes from everywhere, more from above; the rest from one side.
+    """
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    normals = mesh.vertex_normals
+    light = 0.5 + 0.12 * normals[:, 2:] + 0.42 * np.clip(normals @ KEY_LIGHT, 0, None)[:, None]
+    visual: Any = mesh.visual
+    colors = np.asarray(visual.vertex_colors).copy()
+    linear = (colors[:, :3] / 255 * light.clip(0, 1)) ** 2.2  # glTF's vertex colors are linear
+    colors[:, :3] = (255 * linear).round()
+
+    def unlit(tree: dict[str, Any]) -> None:
+        tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}}]
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        for part in tree["meshes"]:
+            for primitive in part["primitives"]:
+                primitive["material"] = 0
+
+    painted = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+    return export_glb(trimesh.Scene(painted), include_normals=False, tree_postprocessor=unlit)
+
+
 def scan_points(scans: Scans, most: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) hits, a random subset of too many, and (N, 3) grays that tell height."""
+    """(N, 3) hits, of too many one for each cube of a lattice, and (N, 3) grays that tell height."""
     from matplotlib import colormaps
 
     hits = scans.hits
     hits = hits[hits.isfinite().all(dim=1)].cpu()
-    if len(hits) > most:
-        hits = hits[torch.randperm(len(hits), generator=torch.Generator().manual_seed(0))[:most]]
-    points = (hits.numpy() - offset).astype(np.float32)
+    points = thinned((hits.numpy() - offset).astype(np.float32), most)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
     return points, colormaps["gray"](shades, bytes=True)[:, :3]
+
+
+def thinned(points: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of (N, 3) points: the first in each cube of a lattice that is coarse enough."""
+    kept, edge = np.arange(len(points)), 0.01
+    while len(kept) > most:
+        cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
+        sides = cells.max(axis=0) + 1
+        kept = np.unique(np.ravel_multi_index(cells.T, sides), return_index=True)[1]
+        edge *= max(1.02, (len(kept) / most) ** 0.4)  # points on surfaces go with the edge squared
+    return points[np.sort(kept)]
 
 
 def knows_variance(model: Any) -> bool:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -28,6 +29,24 @@ SHORTEST = (
     1e-6  # [m] no interval is cut below this: what is left out is no more than the jump times it
 )
 SEGMENTS_AT_ONCE = 1 << 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mover:
+    """What goes along a way, and how cautiously."""
+
+    radius: float = 0.0  # [m] of a sphere; 0 for a point
+    length: float = HAZARD_LENGTH  # [m] over which log-odds count once; smaller is more cautious
+    step: float | None = None  # [m] longest interval looked at as a whole; an obstacle thinner than
+    # this can be missed. None: half that of `raycast`
+
+    def __post_init__(self) -> None:
+        if not (self.radius >= 0 and math.isfinite(self.radius)):
+            raise ValueError(f"radius must be 0 m or more and finite; got {self.radius}")
+        if not self.length > 0:
+            raise ValueError(f"length must be > 0 m; got {self.length}")
+        if self.step is not None and not self.step > 0:
+            raise ValueError(f"step must be > 0 m; got {self.step}")
 
 
 class _Intervals(NamedTuple):
@@ -48,15 +67,7 @@ def hazard(model: Any, points: Tensor, *, length: float = HAZARD_LENGTH) -> Tens
     return model.log_odds(points).clamp(min=0) / length
 
 
-def segment_hazard(
-    model: Any,
-    starts: Tensor,
-    ends: Tensor,
-    radius: float = 0.0,
-    *,
-    length: float = HAZARD_LENGTH,
-    step: float | None = None,
-) -> Tensor:
+def segment_hazard(model: Any, starts: Tensor, ends: Tensor, mover: Mover | None = None) -> Tensor:
     """Number of obstacles that a mover expects to meet on straight ways; differentiable.
 
     The integral of the `hazard` along each way. With z = inv(L) (a - c) and u = inv(L) (b - a) a
@@ -66,32 +77,36 @@ def segment_hazard(
 
     with its middle at m = -z u / |u|^2. Gradients take the neighbors as they are, like those of the map.
 
-    A sphere of a ``radius`` sweeps the ways of all its points; the result is that of the worst of
-    them, over the center and 3^D - 1 points spread over the surface.
+    For a point this is exact, but for obstacles thinner than a step. A sphere sweeps the ways of all
+    its points, and the worst of them counts; it is looked for among the center and 3^D - 1 points
+    spread over the surface, each exact, so the result is a bound from below. `bounding.clearance`
+    is one from the other side: where it is nowhere below the radius, the sphere meets nothing.
 
     Args:
         model: the map.
         starts: (S, D) world positions [m].
         ends: (S, D) world positions [m].
-        radius: of the mover [m]; 0 for a point.
-        length: over which log-odds count once [m]; smaller is more cautious.
-        step: longest interval looked at as a whole [m]; an obstacle thinner than this can be
-            missed. Left out: half that of `raycast`.
+        mover: what goes there; left out: a point.
 
     Returns:
         (S,) float64, 0 or more.
 
     Raises:
-        ValueError: starts and ends are not (S, D) both, or a number is not in its range.
+        ValueError: starts and ends are not (S, D) both.
     """
-    _check(model, starts, ends, radius, length, step)
+    if starts.ndim != 2 or starts.shape != ends.shape or starts.shape[1] != model.dim:
+        raise ValueError(
+            f"starts and ends must be (S, {model.dim}) both; "
+            f"got {tuple(starts.shape)} and {tuple(ends.shape)}"
+        )
+    mover = mover or Mover()
     starts, ends = (x.to(model.origin.device, torch.float64) for x in (starts, ends))
     result = starts.new_zeros(len(starts))
-    boxes = starts.minimum(ends) - radius, starts.maximum(ends) + radius
+    boxes = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
     for rows, part in local_parts(model, *boxes):
-        spacing = ray_step(model, part, 1.0) / 2 if step is None else step
-        met = _segment_hazard(part, starts[rows], ends[rows], radius, spacing) / length
-        result = result.index_copy(0, rows, met)
+        step = ray_step(model, part, 1.0) / 2 if mover.step is None else mover.step
+        met = _segment_hazard(part, starts[rows], ends[rows], mover.radius, step)
+        result = result.index_copy(0, rows, met / mover.length)
     return result
 
 
@@ -110,19 +125,13 @@ def _segment_hazard(model: Any, starts: Tensor, ends: Tensor, radius: float, ste
 
 
 def free_probability(
-    model: Any,
-    starts: Tensor,
-    ends: Tensor,
-    radius: float = 0.0,
-    *,
-    length: float = HAZARD_LENGTH,
-    step: float | None = None,
+    model: Any, starts: Tensor, ends: Tensor, mover: Mover | None = None
 ) -> Tensor:
     """(S,) probability that nothing is met on the way from (S, D) starts to (S, D) ends.
 
     exp(-`segment_hazard`), with its arguments and errors.
     """
-    return torch.exp(-segment_hazard(model, starts, ends, radius, length=length, step=step))
+    return torch.exp(-segment_hazard(model, starts, ends, mover))
 
 
 def expected_range(
@@ -130,9 +139,7 @@ def expected_range(
     origins: Tensor,
     directions: Tensor,
     max_range: float,
-    *,
-    length: float = HAZARD_LENGTH,
-    step: float | None = None,
+    mover: Mover | None = None,
 ) -> Tensor:
     """How far each ray gets on average; differentiable.
 
@@ -144,8 +151,7 @@ def expected_range(
         origins: (R, D) or (D,) starts, world frame [m].
         directions: (R, D) of any length but 0.
         max_range: [m].
-        length: over which log-odds count once [m].
-        step: [m]; left out: as for `raycast`.
+        mover: what goes there; left out: a point, in steps as of `raycast`.
 
     Returns:
         (R,) float64 [m].
@@ -153,24 +159,26 @@ def expected_range(
     Raises:
         ValueError: as for `raycast`.
     """
-    check_rays(model, origins, directions, max_range, step)
+    mover = mover or Mover()
+    check_rays(model, origins, directions, max_range, mover.step)
     origins, directions = unit_rays(model, origins, directions)
     result, ends = origins.new_zeros(len(origins)), origins + max_range * directions
     for rows, part in local_parts(model, origins.minimum(ends), origins.maximum(ends)):
-        spacing = ray_step(model, part, max_range) if step is None else step
+        step = ray_step(model, part, max_range) if mover.step is None else mover.step
         way = origins[rows], directions[rows], max_range
-        result = result.index_copy(0, rows, _expected_range(part, *way, spacing, length))
+        far = _expected_range(part, *way, replace(mover, step=step))
+        result = result.index_copy(0, rows, far)
     return result
 
 
 def _expected_range(
-    model: Any, origins: Tensor, directions: Tensor, max_range: float, step: float, length: float
+    model: Any, origins: Tensor, directions: Tensor, max_range: float, mover: Mover
 ) -> Tensor:
-    count = math.ceil(max_range / step)
+    count = math.ceil(max_range / (mover.step or max_range))
     edges = torch.linspace(0, max_range, count + 1, dtype=torch.float64, device=origins.device)
     points = origins[:, None] + edges[:, None] * directions[:, None]  # (R, count + 1, D)
     starts, ends = (part.reshape(-1, model.dim) for part in (points[:, :-1], points[:, 1:]))
-    met = segment_hazard(model, starts, ends, length=length, step=step).reshape(-1, count)
+    met = segment_hazard(model, starts, ends, mover).reshape(-1, count)
     survived = torch.exp(-(met.cumsum(dim=1) - met))
     small = met < 1e-4
     share = torch.where(small, 1 - met / 2, -torch.expm1(-met) / torch.where(small, 1.0, met))
@@ -248,19 +256,3 @@ def _integrate(model: Any, starts: Tensor, ends: Tensor, pieces: _Intervals) -> 
     values = model.weights.double()[near] * peak * bell * (math.sqrt(math.pi) / 2) / scale
     meters = torch.linalg.vector_norm(way, dim=1)
     return starts.new_zeros(len(starts)).index_add(0, rows, values.sum(dim=1) * meters)
-
-
-def _check(
-    model: Any, starts: Tensor, ends: Tensor, radius: float, length: float, step: float | None
-) -> None:
-    if starts.ndim != 2 or starts.shape != ends.shape or starts.shape[1] != model.dim:
-        raise ValueError(
-            f"starts and ends must be (S, {model.dim}) both; "
-            f"got {tuple(starts.shape)} and {tuple(ends.shape)}"
-        )
-    if not (radius >= 0 and math.isfinite(radius)):
-        raise ValueError(f"radius must be 0 m or more and finite; got {radius}")
-    if not length > 0:
-        raise ValueError(f"length must be > 0 m; got {length}")
-    if step is not None and not step > 0:
-        raise ValueError(f"step must be > 0 m; got {step}")

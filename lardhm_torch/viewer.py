@@ -11,28 +11,17 @@ import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from torch import Tensor
 
+from lardhm_torch.files import replaced_file
 from lardhm_torch.meshing import COLORS, lattice_mesh, surface_lattice
 from lardhm_torch.scans import Scans
-from lardhm_torch.scene import (
-    core_box,
-    ellipsoids,
-    knows_variance,
-    scan_points,
-    slice_picture,
-    variance_colors,
-    view_resolution,
-)
-
-if TYPE_CHECKING:
-    import trimesh
+from lardhm_torch.scene import core_box, knows_variance, variance_colors, view_resolution
+from lardhm_torch.stage import Stage
 
 EXPORT_SUFFIXES = (".html", ".viser")
-OCCUPIED, FREE = (200, 70, 60), (70, 110, 190)  # colors of the clusters
 LATEST_WINS = ("map", "threshold", "color")  # what the worker does, in this order
 
 
@@ -43,7 +32,7 @@ class ViewConfig:
     host: str = "127.0.0.1"  # 0.0.0.0: other machines may look, too
     port: int = 8080  # the next free one, if it is taken
     resolution: float | None = None  # [m] of the surface; None: for about 200,000 faces
-    max_points: int = 1_000_000  # of the scans; a random subset of more
+    max_points: int = 200_000  # of the scans; of more, one for each small cube
     max_clusters: int = 10_000  # ellipsoids; those with the largest weights of more
 
     def __post_init__(self) -> None:
@@ -75,8 +64,8 @@ class MapViewer:
         self.server = _new_server(self.config)
         self._core = core_box(model)
         self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
+        self._stage = Stage(self.server, self.offset)
         self._model = _snapshot(model)
-        self._mesh: Any = None
         self._lattice: Any = None
         self._wanted: set[str] = set()
         self._changed = threading.Condition()
@@ -84,7 +73,7 @@ class MapViewer:
         self._add_controls()
         if scans is not None:
             self._add_scans(scans)
-        self._aim_camera()
+        self._stage.aim(self._core)
         self.update(model)
         self._worker = threading.Thread(target=self._work, daemon=True)
         self._worker.start()
@@ -124,12 +113,8 @@ class MapViewer:
         scene = self.server.get_scene_serializer()
         html = path.suffix.lower() == ".html"
         content = scene.as_html().encode() if html else scene.serialize()
-        partial = path.with_name(f".{path.name}.partial")
-        try:
+        with replaced_file(path) as partial:
             partial.write_bytes(content)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Stop the thread and the server."""
@@ -147,7 +132,8 @@ class MapViewer:
         with gui.add_folder("Surface"):
             self._show_mesh = gui.add_checkbox("show surface", True)
             self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5)
-            colors = [*COLORS, *(["variance"] if knows_variance(self._model) else [])]
+            known = knows_variance(self._model)
+            colors = [color for color in COLORS if known or color != "variance"]
             self._color = gui.add_dropdown("color", colors, initial_value="height")
         lower, upper = (end.numpy() - self.offset for end in self._core)
         with gui.add_folder("Slice"):
@@ -166,8 +152,24 @@ class MapViewer:
         self._color.on_update(lambda _: self._ask("color"))
         for control in (self._show_slice, self._height):
             control.on_update(lambda _: self._draw_slice())
-        for control in (self._show_mesh, self._show_occupied, self._show_free):
-            control.on_update(lambda _: self._apply_visibility())
+        for name, control in (
+            ("/surface", self._show_mesh),
+            ("/clusters/occupied", self._show_occupied),
+            ("/clusters/free", self._show_free),
+        ):
+            self._stage.follow(name, control)
+
+    def _add_scans(self, scans: Scans) -> None:
+        gui = self.server.gui
+        shown = self._stage.draw_scans(scans, self.config.max_points)
+        with gui.add_folder("Scans"):
+            gui.add_markdown(f"{shown:,} of {int(scans.is_return.sum()):,} points")
+            points = gui.add_checkbox("show points", True)
+            sensors = gui.add_checkbox("show sensors", True)
+            size = gui.add_slider("point size [m]", 0.005, 0.1, 0.005, 0.02)
+        self._stage.follow("/scans", points)
+        self._stage.follow("/sensors", sensors)
+        size.on_update(lambda _: self._stage.resize_points(size.value))
 
     def _ask(self, job: str) -> None:
         with self._changed:
@@ -197,115 +199,25 @@ class MapViewer:
         if job == "map":
             resolution = self.config.resolution or view_resolution(model)
             self._lattice = surface_lattice(model, resolution, keep=True)
-            self._draw_clusters(model)
+            self._stage.draw_clusters(model, self.config.max_clusters)
             self._draw_slice()
-        color = self._color.value
-        if job != "color" or self._mesh is None:
-            threshold = float(self._threshold.value)
-            plain = "height" if color == "variance" else color
-            self._mesh = lattice_mesh(model, self._lattice, threshold, color=plain)
-            self._drawn_color = plain
-        mesh = self._mesh
-        if color not in (self._drawn_color, "variance"):
-            threshold = float(self._threshold.value)
-            mesh = self._mesh = lattice_mesh(model, self._lattice, threshold, color=color)
-            self._drawn_color = color
+        color, threshold = self._color.value, float(self._threshold.value)
+        plain = None if color == "variance" else color
+        mesh = lattice_mesh(model, self._lattice, threshold, color=plain)
         if color == "variance" and len(mesh.vertices):
-            mesh.visual.vertex_colors = variance_colors(model, np.asarray(mesh.vertices))
-            self._drawn_color = "variance"
-        self._send_mesh(mesh)
+            visual: Any = mesh.visual
+            visual.vertex_colors = variance_colors(model, np.asarray(mesh.vertices))
+        shown = self._stage.draw_surface(mesh)
         self._status.content = (
             f"{len(model):,} clusters; surface of {len(mesh.faces):,} faces, "
+            f"{shown:,} shown, "
             f"cells of {self._lattice.resolution:.3g} m. "
             f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
         )
 
-    # --- the scene ---
-
-    def _send_mesh(self, mesh: trimesh.Trimesh) -> None:
-        scene = self.server.scene
-        if len(mesh.faces) == 0:
-            scene.remove_by_name("/surface")
-            return
-        moved = mesh.copy()
-        moved.apply_translation(-self.offset)
-        scene.add_mesh_trimesh("/surface", moved, visible=self._show_mesh.value, cast_shadow=False)
-
     def _draw_slice(self) -> None:
-        scene = self.server.scene
-        if not self._show_slice.value:
-            scene.remove_by_name("/slice")
-            return
-        height = float(self._height.value)
-        picture = slice_picture(self._model, height, self._core, self.offset)
-        scene.add_image("/slice", **picture, cast_shadow=False, receive_shadow=False)
-
-    def _draw_clusters(self, model: Any) -> None:
-        weights = model.weights.detach()
-        order = weights.abs().argsort(descending=True)[: self.config.max_clusters]
-        for name, color, mask, control in (
-            ("/clusters/occupied", OCCUPIED, weights[order] > 0, self._show_occupied),
-            ("/clusters/free", FREE, weights[order] < 0, self._show_free),
-        ):
-            chosen = order[mask]
-            if len(chosen):
-                self._send_ellipsoids(model, name, color, chosen, control.value)
-            else:
-                self.server.scene.remove_by_name(name)
-
-    def _send_ellipsoids(
-        self, model: Any, name: str, color: tuple[int, int, int], chosen: Tensor, visible: bool
-    ) -> None:
-        self.server.scene.add_batched_meshes_simple(
-            name,
-            **ellipsoids(model, chosen, self.offset),
-            batched_colors=color,
-            opacity=0.9,
-            cast_shadow=False,
-            receive_shadow=False,
-            visible=visible,
-        )
-
-    def _add_scans(self, scans: Scans) -> None:
-        points, colors = scan_points(scans, self.config.max_points, self.offset)
-        gui, scene = self.server.gui, self.server.scene
-        with gui.add_folder("Scans"):
-            self._show_scans = gui.add_checkbox("show points", True)
-            self._show_origins = gui.add_checkbox("show sensors", True)
-            size = gui.add_slider("point size [m]", 0.005, 0.1, 0.005, 0.02)
-        cloud = scene.add_point_cloud(
-            "/scans", points, colors, point_size=0.02, precision="float32"
-        )
-        origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
-        sensors = scene.add_point_cloud(
-            "/sensors", origins, (255, 150, 0), point_size=0.12, point_shape="circle"
-        )
-
-        def apply(_: Any) -> None:
-            cloud.visible, sensors.visible = self._show_scans.value, self._show_origins.value
-            cloud.point_size = size.value
-
-        for control in (self._show_scans, self._show_origins, size):
-            control.on_update(apply)
-
-    def _apply_visibility(self) -> None:
-        for name, control in (
-            ("/surface", self._show_mesh),
-            ("/clusters/occupied", self._show_occupied),
-            ("/clusters/free", self._show_free),
-        ):
-            handle = self.server.scene.get_handle_by_name(name)
-            if handle is not None:
-                handle.visible = control.value
-
-    def _aim_camera(self) -> None:
-        """From obliquely above, far enough to see where most clusters are."""
-        low, high = (end.numpy() - self.offset for end in self._core)
-        reach = max(float(np.linalg.norm(high - low)), 1.0)
-        camera = self.server.initial_camera
-        camera.look_at = tuple((low + high) / 2)
-        camera.position = tuple((low + high) / 2 + reach * np.array([0.25, -0.5, 0.5]))
-        self.server.scene.set_up_direction("+z")
+        height = float(self._height.value) if self._show_slice.value else None
+        self._stage.draw_slice(self._model, height, self._core)
 
 
 class LiveView:

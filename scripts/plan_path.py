@@ -18,7 +18,7 @@ from torch import Tensor
 from lardhm_torch import LardHilbertMap, sample_rays, simulate_room
 from lardhm_torch.bounding import clearance
 from lardhm_torch.querying import query_slice
-from lardhm_torch.segments import free_probability, segment_hazard
+from lardhm_torch.segments import Mover, free_probability, segment_hazard
 
 START, GOAL = (0.8, 1.9), (7.1, 2.4)  # [m]
 HEIGHTS = (0.5, 0.75)  # [m] of the robot's body where it is checked
@@ -71,7 +71,8 @@ def free(model: LardHilbertMap, path: Tensor) -> float:
     chance = 1.0
     for height in HEIGHTS:
         points = at_height(path, height)
-        chance = min(chance, float(free_probability(model, points[:-1], points[1:], RADIUS).prod()))
+        free = free_probability(model, points[:-1], points[1:], Mover(radius=RADIUS))
+        chance = min(chance, float(free.prod()))
     return chance
 
 

@@ -17,7 +17,7 @@ from lardhm_torch import LardHilbertMap, raycast, sample_rays, simulate_room
 from lardhm_torch.bounding import clearance
 from lardhm_torch.exploring import frontiers, information_gain
 from lardhm_torch.querying import grid, occupancy_gradient, query_slice
-from lardhm_torch.segments import expected_range, free_probability
+from lardhm_torch.segments import Mover, expected_range, free_probability
 
 HEIGHT = 1.1  # [m]
 BOUNDS = ([0.0, 0.0], [8.0, 5.0])  # [m]
@@ -68,7 +68,7 @@ def draw_segments(model: LardHilbertMap, path: Path) -> None:
 
     start = torch.tensor([[3.2, 3.2, HEIGHT]], dtype=torch.float64)
     ends = start + fan(72) * torch.tensor([1.8, 2.4, 3.0], dtype=torch.float64).repeat(24)[:, None]
-    chance = free_probability(model, start.expand_as(ends), ends, 0.15)
+    chance = free_probability(model, start.expand_as(ends), ends, Mover(radius=0.15))
     figure, axes = canvas(model, "free_probability of a sphere of 15 cm on straight ways")
     for end, p in zip(ends, chance, strict=True):
         color = colormaps["RdYlGn"](float(p))

@@ -32,9 +32,9 @@ def random_map(dim, dtype=F64, seed=0, clusters=60, neighbors=7, spread=2.0):
     labels = (points[:, 0].sin() > 0).to(dtype)
     model.fit(points.to(dtype), labels, num_clusters=clusters)
     model.weights.data = 5 * torch.randn(len(model), generator=rng, dtype=dtype)
-    model.raw_scale_tril.data += 0.5 * torch.randn(
-        model.raw_scale_tril.shape, generator=rng, dtype=dtype
-    ).tril()
+    model.raw_scale_tril.data += (
+        0.5 * torch.randn(model.raw_scale_tril.shape, generator=rng, dtype=dtype).tril()
+    )
     return model.requires_grad_(False)
 
 
