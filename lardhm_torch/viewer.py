@@ -22,7 +22,6 @@ from lardhm_torch.scene import core_box, knows_variance, variance_colors, view_r
 from lardhm_torch.stage import Stage
 
 EXPORT_SUFFIXES = (".html", ".viser")
-LATEST_WINS = ("map", "threshold", "color")  # what the worker does, in this order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +66,7 @@ class MapViewer:
         self._stage = Stage(self.server, self.offset)
         self._model = _snapshot(model)
         self._lattice: Any = None
+        self._report = ""
         self._wanted: set[str] = set()
         self._changed = threading.Condition()
         self._closed = False
@@ -148,10 +148,10 @@ class MapViewer:
         with gui.add_folder("Clusters"):
             self._show_occupied = gui.add_checkbox("show occupied", False)
             self._show_free = gui.add_checkbox("show free", False)
-        self._threshold.on_update(lambda _: self._ask("threshold"))
-        self._color.on_update(lambda _: self._ask("color"))
+        self._threshold.on_update(lambda _: self._ask("surface"))
+        self._color.on_update(lambda _: self._ask("surface"))
         for control in (self._show_slice, self._height):
-            control.on_update(lambda _: self._draw_slice())
+            control.on_update(lambda _: self._ask("slice"))
         for name, control in (
             ("/surface", self._show_mesh),
             ("/clusters/occupied", self._show_occupied),
@@ -183,24 +183,33 @@ class MapViewer:
                 self._changed.wait_for(lambda: self._wanted or self._closed)
                 if self._closed:
                     return
-                job = next(name for name in LATEST_WINS if name in self._wanted)
+                jobs = self._wanted
                 self._wanted = {"busy"}  # one drawing answers all that was asked for until now
                 model = self._model
             try:
                 self._status.content = "*drawing ...*"
-                self._draw(model, job)
+                self._draw(model, jobs)
             except Exception as error:
                 self._status.content = f"**{type(error).__name__}**: {error}"
             with self._changed:
                 self._wanted.discard("busy")
                 self._changed.notify_all()
 
-    def _draw(self, model: Any, job: str) -> None:
-        if job == "map":
+    def _draw(self, model: Any, jobs: set[str]) -> None:
+        """The slice, the surface, or all of a new map: what is among the jobs."""
+        if "map" in jobs:
             resolution = self.config.resolution or view_resolution(model)
             self._lattice = surface_lattice(model, resolution, keep=True)
             self._stage.draw_clusters(model, self.config.max_clusters)
-            self._draw_slice()
+        if jobs & {"map", "slice"}:
+            height = float(self._height.value) if self._show_slice.value else None
+            self._stage.draw_slice(model, height, self._core)
+        if jobs & {"map", "surface"}:
+            self._report = self._draw_surface(model)
+        self._status.content = self._report
+
+    def _draw_surface(self, model: Any) -> str:
+        """Draws it, and says what was drawn."""
         color, threshold = self._color.value, float(self._threshold.value)
         plain = None if color == "variance" else color
         mesh = lattice_mesh(model, self._lattice, threshold, color=plain)
@@ -208,16 +217,11 @@ class MapViewer:
             visual: Any = mesh.visual
             visual.vertex_colors = variance_colors(model, np.asarray(mesh.vertices))
         shown = self._stage.draw_surface(mesh)
-        self._status.content = (
+        return (
             f"{len(model):,} clusters; surface of {len(mesh.faces):,} faces, "
-            f"{shown:,} shown, "
-            f"cells of {self._lattice.resolution:.3g} m. "
+            f"{shown:,} shown, cells of {self._lattice.resolution:.3g} m. "
             f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
         )
-
-    def _draw_slice(self) -> None:
-        height = float(self._height.value) if self._show_slice.value else None
-        self._stage.draw_slice(self._model, height, self._core)
 
 
 class LiveView:

@@ -5,6 +5,8 @@ import shutil
 import numpy as np
 import pytest
 import torch
+import trimesh
+from scipy.spatial import cKDTree
 
 from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, scene, simulate_room
 from lardhm_torch.viewer import LiveView, MapViewer, ViewConfig
@@ -110,6 +112,8 @@ def test_what_is_clicked_in_the_browser_is_seen(model, scans, page):
         assert share_drawn(nothing) < 0.02
 
         page.get_by_label("show slice").click()
+        page.wait_for_timeout(1000)
+        shown.wait()
         cut = settled(page)
         assert share_drawn(cut) > 0.03
         blue = (cut[..., 2] - cut[..., 0] > 60).mean()
@@ -190,6 +194,34 @@ def test_the_page_of_a_map_to_come_opens_with_its_first_cluster(model):
     assert live.viewer.url.startswith("http://127.0.0.1:")
     live.viewer.wait()
     live.close()
+
+
+def test_the_page_shows_no_more_than_its_budgets_and_the_mesh_keeps_its_faces(scans):
+    mesh = trimesh.creation.icosphere(5)  # 20,480 faces
+    mesh.visual.vertex_colors = np.tile([10, 200, 30, 255], (len(mesh.vertices), 1))
+    fewer = scene.fewer_faces(mesh, 2000)
+    assert 1000 < len(fewer.faces) <= 2000
+    assert len(mesh.faces) == 20_480
+    assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 1).max() < 0.02
+    assert (fewer.visual.vertex_colors == [10, 200, 30, 255]).all()
+    assert scene.fewer_faces(mesh, 30_000) is mesh
+    points, colors = scene.scan_points(scans, 1500, np.zeros(3))
+    assert 700 < len(points) <= 1500
+    assert len(colors) == len(points)
+    everywhere = scene.scan_points(scans, 10**6, np.zeros(3))[0]
+    assert len(everywhere) == len(scans.hits)
+    gaps = cKDTree(points).query(everywhere)[0]
+    assert gaps.max() < 0.5  # evenly thinned: none of the room is left out
+
+
+def test_painted_light_is_brighter_on_what_faces_it():
+    ball = trimesh.creation.icosphere(3)
+    ball.visual.vertex_colors = np.tile([200, 100, 50, 255], (len(ball.vertices), 1))
+    shown = trimesh.load(io.BytesIO(scene.painted_glb(ball)), file_type="glb", force="mesh")
+    brightness = np.asarray(shown.visual.vertex_attributes["color"])[:, :3].astype(int).sum(axis=1)
+    toward = shown.vertices @ scene.KEY_LIGHT
+    assert brightness[toward > 0.9].min() > brightness[toward < 0].max()
+    assert b"KHR_materials_unlit" in scene.painted_glb(ball)
 
 
 class UnsureMap(LardHilbertMap):
