@@ -31,7 +31,7 @@ class ViewConfig:
     host: str = "127.0.0.1"  # 0.0.0.0: other machines may look, too
     port: int = 8080  # the next free one, if it is taken
     resolution: float | None = None  # [m] of the surface; None: for about 200,000 faces
-    max_points: int = 200_000  # of the scans; of more, one for each small cube
+    max_points: int = 100_000  # of the scans; of more, one for each small cube
     max_clusters: int = 10_000  # ellipsoids; those with the largest weights of more
 
     def __post_init__(self) -> None:
