@@ -105,23 +105,22 @@ def segment_hazard(model: Any, starts: Tensor, ends: Tensor, mover: Mover | None
     boxes = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
     for rows, part in local_parts(model, *boxes):
         step = ray_step(model, part, 1.0) / 2 if mover.step is None else mover.step
-        met = _segment_hazard(part, starts[rows], ends[rows], replace(mover, step=step))
-        result = result.index_copy(0, rows, met)
+        met = _segment_hazard(part, starts[rows], ends[rows], mover.radius, step)
+        result = result.index_copy(0, rows, met / mover.length)
     return result
 
 
-def _segment_hazard(model: Any, starts: Tensor, ends: Tensor, mover: Mover) -> Tensor:
-    """(S,) the most obstacles met on the ways of a ball's points; the mover has a step."""
-    assert mover.step is not None
-    offsets = _ball(model.dim, mover.radius).to(starts.device)
+def _segment_hazard(model: Any, starts: Tensor, ends: Tensor, radius: float, step: float) -> Tensor:
+    """(S,) the largest integral of log-odds above 0 over the ways of a ball's points [m]."""
+    offsets = _ball(model.dim, radius).to(starts.device)
     starts = (starts[:, None] + offsets).reshape(-1, model.dim)
     ends = (ends[:, None] + offsets).reshape(-1, model.dim)
     parts = [starts.new_zeros(0)]
     for start, end in zip(
         starts.split(SEGMENTS_AT_ONCE), ends.split(SEGMENTS_AT_ONCE), strict=True
     ):
-        pieces = _cut(model, start.detach(), end.detach(), mover.step)
-        parts.append(_integrate(model, start, end, pieces) / mover.length)
+        pieces = _cut(model, start.detach(), end.detach(), step)
+        parts.append(_integrate(model, start, end, pieces))
     return torch.cat(parts).reshape(-1, len(offsets)).amax(dim=1)
 
 
@@ -167,15 +166,15 @@ def expected_range(
     for rows, part in local_parts(model, origins.minimum(ends), origins.maximum(ends)):
         step = ray_step(model, part, max_range) if mover.step is None else mover.step
         way = origins[rows], directions[rows], max_range
-        result = result.index_copy(0, rows, _expected_range(part, *way, replace(mover, step=step)))
+        far = _expected_range(part, *way, replace(mover, step=step))
+        result = result.index_copy(0, rows, far)
     return result
 
 
 def _expected_range(
     model: Any, origins: Tensor, directions: Tensor, max_range: float, mover: Mover
 ) -> Tensor:
-    assert mover.step is not None
-    count = math.ceil(max_range / mover.step)
+    count = math.ceil(max_range / (mover.step or max_range))
     edges = torch.linspace(0, max_range, count + 1, dtype=torch.float64, device=origins.device)
     points = origins[:, None] + edges[:, None] * directions[:, None]  # (R, count + 1, D)
     starts, ends = (part.reshape(-1, model.dim) for part in (points[:, :-1], points[:, 1:]))

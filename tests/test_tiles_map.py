@@ -12,7 +12,7 @@ from lardhm_torch.io import load_scans
 from lardhm_torch.querying import map_bounds, occupancy_gradient, query_grid
 from lardhm_torch.rays import surface_step
 from lardhm_torch.scans import split_rays
-from lardhm_torch.segments import expected_range, segment_hazard
+from lardhm_torch.segments import Mover, expected_range, segment_hazard
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
 from lardhm_torch.tiles.manifest import tile_indices, tile_path, write_manifest
@@ -250,11 +250,14 @@ def test_segments_and_frontiers_are_those_of_the_merged_map(tmp_path, monkeypatc
     rng = torch.Generator().manual_seed(0)
     starts, ends = 100 + 20 * torch.rand(2, 20, 3, generator=rng, dtype=F64)
     starts.requires_grad_()
-    met = [segment_hazard(m, starts, ends, step=0.1) for m in (tiles, single)]
+    met = [segment_hazard(m, starts, ends, Mover(step=0.1)) for m in (tiles, single)]
     assert met[1].max() > 0
     torch.testing.assert_close(*met)
     torch.testing.assert_close(*(torch.autograd.grad(m.sum(), starts)[0] for m in met))
-    far = [expected_range(m, starts.detach(), ends - 110, 4.0, step=0.2) for m in (tiles, single)]
+    far = [
+        expected_range(m, starts.detach(), ends - 110, 4.0, Mover(step=0.2))
+        for m in (tiles, single)
+    ]
     torch.testing.assert_close(*far)
     found = [frontiers(m, [102] * 3, [107] * 3, 0.25) for m in (tiles, single)]
     assert torch.equal(found[0].points, found[1].points)
