@@ -273,8 +273,9 @@ def _figure_five(result: dict[str, Any]) -> str:
     return (
         f"## Fig. 5: built keyframe by keyframe ({result['keyframes']} keyframes, {result['rays']:,} rays)\n\n"
         "![incremental map](figure_5.png)\n\n"
-        f"Each keyframe brings 100 clusters, merged or appended (Algorithm 2): {sizes[0]} clusters after the first, "
-        f"{sizes[-1]} after the last of {100 * result['keyframes']} offered; {result['update_s']:.2f} s an update (median)."
+        f"Each keyframe may bring 100 clusters; here new points join the clusters that explain them and only the others make new "
+        f"ones, where Algorithm 2 clusters all of them and merges: {sizes[0]} clusters after the first keyframe, {sizes[-1]} after "
+        f"the last of {100 * result['keyframes']} offered; {result['update_s']:.2f} s an update (median)."
     )
 
 
