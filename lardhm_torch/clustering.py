@@ -14,7 +14,9 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.native import nearest_centers
 
-POINTS_PER_CLUSTER = 15  # of the rule that chooses the number of clusters
+POINTS_PER_CLUSTER = 15  # of the rule that chooses the number of clusters, where points are sparse
+DENSE_POINTS = 35  # the same where they are dense, or clusters would fit the noise of the hits
+CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] of the cells that tell the two apart, and how
 MAX_CHOSEN = 5000  # a class
 START_POINTS = 50  # a center, drawn at random, among which the start is chosen
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
@@ -78,7 +80,7 @@ def cluster_classes(
         (M clusters, the occupied ones first; (M,) bool, which are occupied).
     """
     classes = [points[labels > 0.5], points[labels <= 0.5]]
-    totals = split_clusters([len(members) for members in classes], num_clusters)
+    totals = split_clusters(classes, num_clusters)
     parts = [
         cluster_points(members, total, rng)
         for members, total in zip(classes, totals, strict=True)
@@ -98,22 +100,41 @@ def concatenate_clusters(parts: list[Clusters]) -> Clusters:
     )
 
 
-def split_clusters(class_sizes: list[int], num_clusters: int | None) -> list[int]:
+def split_clusters(classes: list[Tensor], num_clusters: int | None) -> list[int]:
     """How many clusters each of the two classes gets.
 
     Half each, the odd one to the occupied class; a class that cannot fill its half (five points a
-    cluster) leaves the rest to the other. ``None``: one for every `POINTS_PER_CLUSTER` occupied
-    points and at most `MAX_CHOSEN` a class, the same number for free space, whose samples are as
-    many as the sampler was asked for and so say nothing about the scene. More clusters than that
-    are starved of points, and accuracy falls (paper, Section IV-B).
+    cluster) leaves the rest to the other.
+
+    Args:
+        classes: (N, D) occupied and (F, D) free positions [m].
+        num_clusters: total; None: chosen by `choose_num_clusters`.
     """
-    room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
+    sizes = [len(members) for members in classes]
+    room = [max(1, size // MIN_COUNT) if size else 0 for size in sizes]
     if num_clusters is None:
-        basis = class_sizes[0] or class_sizes[1]
-        chosen = min(MAX_CHOSEN, max(1, basis // POINTS_PER_CLUSTER))
+        chosen = choose_num_clusters(classes[0] if sizes[0] else classes[1])
         return [min(chosen, space) for space in room]
     occupied = min(room[0], max(-(-num_clusters // 2), num_clusters - room[1]))
     return [occupied, min(room[1], num_clusters - occupied)]
+
+
+def choose_num_clusters(points: Tensor) -> int:
+    """How many clusters each class gets where points are occupied; the free class gets as many.
+
+    One for every `CELLS_PER_CLUSTER` cells with points in them, so that clusters are as fine as the
+    scene is large; of at least `POINTS_PER_CLUSTER` points on average, or they would be starved and
+    accuracy fall (paper, Section IV-B), and of at most `DENSE_POINTS`. The number of free points says
+    what the sampler was asked for, and nothing about the scene.
+
+    Args:
+        points: (N, D) positions [m].
+    """
+    cells = (points / CELL_EDGE).floor().long()
+    strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
+    count = len((cells * strides).sum(dim=1).unique())
+    finest, coarsest = len(points) // POINTS_PER_CLUSTER, len(points) // DENSE_POINTS
+    return max(1, min(max(count // CELLS_PER_CLUSTER, coarsest), finest, MAX_CHOSEN))
 
 
 def mini_batch_kmeans(

@@ -10,14 +10,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import checkpoint
 from lardhm_torch.clustering import split_clusters
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.incremental import UpdateConfig
-from lardhm_torch.sampling import NoUsableRayError, SamplingConfig, sample_rays
+from lardhm_torch.incremental import UpdateConfig, split_classes
+from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
 from lardhm_torch.scans import Scans
 
 
@@ -165,15 +164,15 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
     except NoUsableRayError as error:
         warnings.warn(f"scan {number} was passed over: no usable ray; {error}", stacklevel=3)
         return
-    num_clusters = _num_clusters(samples.labels, config)
+    num_clusters = _num_clusters(samples, config)
     model.update(samples.points, samples.labels, num_clusters, seed=seed, config=config.update)
     if config.radius is not None:
         model.crop(scan.origins[0], config.radius)
 
 
-def _num_clusters(labels: Tensor, config: StreamConfig) -> int | None:
+def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
     if config.max_clusters is None:
         return config.num_clusters
-    hits = int(labels.sum())
-    chosen = config.num_clusters or sum(split_clusters([hits, len(labels) - hits], None))
+    classes = split_classes(samples.points, samples.labels > 0.5)
+    chosen = config.num_clusters or sum(split_clusters(classes, None))
     return min(chosen, config.max_clusters)

@@ -8,6 +8,7 @@ from sklearn.cluster import MiniBatchKMeans
 from lardhm_torch import native
 from lardhm_torch.clustering import (
     Clusters,
+    choose_num_clusters,
     cluster_classes,
     cluster_points,
     clusters_about,
@@ -164,9 +165,21 @@ def test_classes_are_clustered_apart_occupied_first():
         ([1000, 0], 100, [100, 0]),
         ([3, 3], 500, [1, 1]),
         ([1500, 8000], None, [100, 100]),
+        ([1500, 300], None, [100, 60]),
         ([0, 300], None, [0, 20]),
-        ([10**7, 10**8], None, [5000, 5000]),
     ],
 )
 def test_clusters_are_split_over_the_classes(sizes, asked, given_out):
-    assert split_clusters(sizes, asked) == given_out
+    classes = [torch.rand(size, 3, generator=rng()) * 1e3 for size in sizes]
+    assert split_clusters(classes, asked) == given_out
+
+
+@pytest.mark.parametrize(
+    ("points_a_cell", "points_a_cluster"), [(1, 15), (3, 15), (6, 24), (20, 35)]
+)
+def test_clusters_are_as_fine_as_space_unless_starved_or_crowded(points_a_cell, points_a_cluster):
+    line = (torch.arange(2000, dtype=F64) + 0.5)[:, None] * torch.tensor([0.2, 0.0, 0.0], dtype=F64)
+    points = line.repeat(points_a_cell, 1) - 100.0
+    assert choose_num_clusters(points) == pytest.approx(len(points) / points_a_cluster, abs=1)
+    assert choose_num_clusters(points[:3]) == 1
+    assert choose_num_clusters(torch.rand(200_000, 3, generator=rng()) * 1e3) == 5000
