@@ -26,7 +26,6 @@ from lardhm_torch import (
     SamplingConfig,
     Scans,
     TuneConfig,
-    clustering,
     fine_tune,
     load_scans,
     native,
@@ -54,7 +53,7 @@ class Choice:
     model: dict[str, Any] = field(default_factory=dict)
     fit: dict[str, Any] = field(default_factory=dict)
     tune: dict[str, Any] | None = field(default_factory=dict)  # None: not tuned
-    points_per_cluster: int = clustering.POINTS_PER_CLUSTER
+    hits_per_cluster: int | None = None  # None: chosen from the data
     resample: bool = True
     kernel: Kernel | None = None  # weights alone, on the fitted clusters
 
@@ -83,8 +82,9 @@ CHOICES = {
     "k = 24": Choice(model={"num_neighbors": 24}),
     "covariance scale 2.5": Choice(model={"covariance_scale": 2.5}),
     "covariance scale 8": Choice(model={"covariance_scale": 8.0}),
-    "a cluster for 10 hits": Choice(points_per_cluster=10),
-    "a cluster for 30 hits": Choice(points_per_cluster=30),
+    "a cluster for 10 hits": Choice(hits_per_cluster=10),
+    "a cluster for 15 hits": Choice(hits_per_cluster=15),
+    "a cluster for 30 hits": Choice(hits_per_cluster=30),
     "no near samples": Choice(sampling={"near_samples": 0}),
     "1 near sample": Choice(sampling={"near_samples": 1}),
     "3 free samples a ray": Choice(sampling={"free_samples": 3}),
@@ -112,14 +112,10 @@ def build(train: Scans, choice: Choice, seed: int) -> Model:
     sampling = SamplingConfig(**choice.sampling)
     samples = sample_rays(train, sampling, seed=seed)
     model = LardHilbertMap(dim=train.dim, **choice.model)
-    default, clustering.POINTS_PER_CLUSTER = (
-        clustering.POINTS_PER_CLUSTER,
-        choice.points_per_cluster,
-    )
-    try:
-        model.fit(samples.points, samples.labels, seed=seed, config=FitConfig(**choice.fit))
-    finally:
-        clustering.POINTS_PER_CLUSTER = default
+    hits = int(samples.labels.sum())
+    num_clusters = 2 * hits // choice.hits_per_cluster if choice.hits_per_cluster else None
+    config = FitConfig(**choice.fit)
+    model.fit(samples.points, samples.labels, num_clusters, seed=seed, config=config)
     if choice.kernel is not None:
         return _with_kernel(model, samples.points, samples.labels, choice.kernel)
     if choice.tune is not None:
