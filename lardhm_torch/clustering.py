@@ -80,7 +80,10 @@ def cluster_classes(
         (M clusters, the occupied ones first; (M,) bool, which are occupied).
     """
     classes = [points[labels > 0.5], points[labels <= 0.5]]
-    totals = split_clusters(classes, num_clusters)
+    if num_clusters is None:
+        totals = [choose_num_clusters(classes[0] if len(classes[0]) else classes[1])] * 2
+    else:
+        totals = split_clusters([len(members) for members in classes], num_clusters)
     parts = [
         cluster_points(members, total, rng)
         for members, total in zip(classes, totals, strict=True)
@@ -100,27 +103,23 @@ def concatenate_clusters(parts: list[Clusters]) -> Clusters:
     )
 
 
-def split_clusters(classes: list[Tensor], num_clusters: int | None) -> list[int]:
+def split_clusters(class_sizes: list[int], num_clusters: int | None) -> list[int]:
     """How many clusters each of the two classes gets.
 
     Half each, the odd one to the occupied class; a class that cannot fill its half (five points a
-    cluster) leaves the rest to the other.
-
-    Args:
-        classes: (N, D) occupied and (F, D) free positions [m].
-        num_clusters: total; None: chosen by `choose_num_clusters`.
+    cluster) leaves the rest to the other. ``None``: as many as `choose_num_clusters` gives at most,
+    which is right for a single scan of a place that others will fill up.
     """
-    sizes = [len(members) for members in classes]
-    room = [max(1, size // MIN_COUNT) if size else 0 for size in sizes]
+    room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
     if num_clusters is None:
-        chosen = choose_num_clusters(classes[0] if sizes[0] else classes[1])
-        return [min(chosen, space) for space in room]
+        finest = (class_sizes[0] or class_sizes[1]) // POINTS_PER_CLUSTER
+        return [min(max(1, finest), MAX_CHOSEN, space) for space in room]
     occupied = min(room[0], max(-(-num_clusters // 2), num_clusters - room[1]))
     return [occupied, min(room[1], num_clusters - occupied)]
 
 
 def choose_num_clusters(points: Tensor) -> int:
-    """How many clusters each class gets where points are occupied; the free class gets as many.
+    """How many clusters `fit` makes of a class with these occupied points; of the free one as many.
 
     One for every `CELLS_PER_CLUSTER` cells with points in them, so that clusters are as fine as the
     scene is large; of at least `POINTS_PER_CLUSTER` points on average, or they would be starved and

@@ -122,7 +122,7 @@ def updated(
         )
     else:
         part = known
-        totals = split_clusters(classes, num_clusters)
+        totals = split_clusters([len(members) for members in classes], num_clusters)
         for kind, members, total in zip((True, False), classes, totals, strict=True):
             if total:
                 part = absorb(part, members, kind, total, task)
