@@ -77,7 +77,7 @@ The simulated room is the paper's own data. Its RIEGL and LSD-SLAM scans are not
 make (`riegl_vz400i_rtls`) and the semi-dense pixels of RGB-D frames (`sevenscenes_semidense`) stand for them, so
 those figures compare orders, not digits. Every method sees the same training rays and the same labelled samples of
 them (OctoMap: the rays). **Settings of the baselines are chosen on a validation fifth of the training rays; LARD-HM
-keeps its defaults everywhere.** Original HM is trained by the same optimizer as ours (balanced, preconditioned SGD),
+keeps its defaults everywhere** (which were chosen on this and seven other sets, on some of the same splits). Original HM is trained by the same optimizer as ours (balanced, preconditioned SGD),
 not by the plain SGD of the paper: a stronger baseline than theirs."""
 
 
