@@ -29,6 +29,14 @@ FLAGS = (
     "-fno-trapping-math", "-fno-tree-slp-vectorize",  # packs neighbors through memory, and stalls
     "-fPIC", "-w", "-DTORCH_TARGET_VERSION=0x020a000000000000",
 )  # fmt: skip
+# Sources that are compiled together, the longest job first: torch's headers take a second a unit.
+UNITS = (
+    ("raycast",),
+    ("update", "pooling", "index", "parameters", "kth_distance"),
+    ("kmeans", "descent", "gradients"),
+    ("search",),
+    ("query",),
+)
 COMPILERS = ("c++", "g++", "clang++")
 OFF = ("0", "false", "off", "no")
 
@@ -128,10 +136,10 @@ def _processor_flags() -> bytes:
 
 
 def _compile(compiler: list[str], target: Path) -> None:
-    """Every source by itself, as many at once as there are processors, then one library of all."""
+    """Unit by unit, as many at once as there are processors, then one library of all."""
     root = Path(torch.__file__).parent
-    sources = sorted(FOLDER.glob("*.cpp"), reverse=True)  # the largest is the last by name
-    objects = [target.with_name(f"{source.stem}.o") for source in sources]
+    sources = _write_units(target.parent)
+    objects = [source.with_suffix(".o") for source in sources]
     commands = [
         [*compiler, *FLAGS, f"-isystem{root / 'include'}", "-c", str(source), "-o", str(made)]
         for source, made in zip(sources, objects, strict=True)
@@ -143,6 +151,16 @@ def _compile(compiler: list[str], target: Path) -> None:
         f"-L{root / 'lib'}", "-ltorch", "-ltorch_cpu", "-lc10",
     ]  # fmt: skip
     _run(link, target)
+
+
+def _write_units(folder: Path) -> list[Path]:
+    """Files that include the sources of a unit each; a source that no unit names is one by itself."""
+    others = {source.stem for source in FOLDER.glob("*.cpp")}.difference(*UNITS)
+    units = [*UNITS, *((name,) for name in sorted(others))]
+    paths = [folder / f"{unit[0]}.cpp" for unit in units]
+    for path, unit in zip(paths, units, strict=True):
+        path.write_text("".join(f'#include "{FOLDER / name}.cpp"\n' for name in unit))
+    return paths
 
 
 def _run(command: list[str], made: Path) -> None:
