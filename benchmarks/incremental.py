@@ -34,7 +34,7 @@ from lardhm_torch import (
     stream_scans,
 )
 from lardhm_torch.baselines.octomap import new_tree, to_array
-from lardhm_torch.clustering import cluster_points, concatenate_clusters, z_order
+from lardhm_torch.clustering import along_curve, cluster_each, split_classes
 from lardhm_torch.metrics import evaluate, protocol_rays
 from lardhm_torch.streaming import real_time
 
@@ -71,14 +71,9 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
     model = LardHilbertMap()
     origin = samples.points.mean(dim=0).round()
     local = (samples.points - origin).float()
-    order = z_order(local)
-    local, labels = local[order], samples.labels[order]
-    parts = [
-        cluster_points(local[labels > 0.5], occupied, rng),
-        cluster_points(local[labels <= 0.5], free, rng),
-    ]
-    clusters = concatenate_clusters(parts)
-    model._grow(clusters, torch.arange(len(clusters)) < len(parts[0]), origin)
+    local, labels = along_curve(local, samples.labels)
+    clusters = cluster_each(split_classes(local, labels > 0.5), (occupied, free), rng)
+    model._grow(*clusters, origin)
     model._train_weights(local, labels, FitConfig(), rng, False)
     return model
 

@@ -36,10 +36,10 @@ from workers import plain_path
 
 from lardhm_torch import FitConfig, LardHilbertMap, native
 from lardhm_torch.clustering import (
+    along_curve,
     clusters_about,
     factor_covariances,
     mini_batch_kmeans,
-    z_order,
 )
 from lardhm_torch.fitting import deal_samples, fit_weights
 
@@ -165,8 +165,7 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
 
     def kmeans() -> list[torch.Tensor]:
         rng = torch.Generator().manual_seed(0)
-        ordered = (points.index_select(0, z_order(points)) for points in classes)
-        return [mini_batch_kmeans(points, half, rng) for points in ordered]
+        return [mini_batch_kmeans(*along_curve(points), half, rng) for points in classes]
 
     centers = kmeans()
 
@@ -176,8 +175,7 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
             factor_covariances(clusters.covariances, model.min_lengthscale)
 
     config, rng = FitConfig(), torch.Generator().manual_seed(0)
-    order = z_order(task.points)
-    samples = ((task.points - model.origin.float())[order], task.labels[order])
+    samples = along_curve(task.points - model.origin.float(), task.labels)
     local, labels = deal_samples(samples, config.rows_a_batch(len(task.points)), rng)
     state = (model.centers, model.raw_scale_tril, model.kernel)
     index = native.build_index(model.centers, model.num_neighbors)
@@ -208,8 +206,7 @@ def kmeans(arguments: argparse.Namespace) -> Result:
     half = NUM_CLUSTERS // 2
 
     def ours() -> torch.Tensor:
-        ordered = points.index_select(0, z_order(points))
-        return mini_batch_kmeans(ordered, half, torch.Generator().manual_seed(0))
+        return mini_batch_kmeans(*along_curve(points), half, torch.Generator().manual_seed(0))
 
     def theirs() -> Any:
         return sklearn_kmeans(points.numpy(), half)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.fitting import class_factors, logistic_loss
+from lardhm_torch.fitting import balance_classes, label_factors, logistic_loss
 from lardhm_torch.hilbert_map import LardHilbertMap
 
 WARM_UP_STEPS = 20  # over which the rates rise to their full value
@@ -117,7 +117,7 @@ class TuningRun:
         """One epoch over the points."""
         config, count = self.config, len(samples.labels)
         batch_size = config.batch_size or min(MAX_BATCH, max(1024, count // 64))
-        factors = class_factors(samples.labels, config.occupied_share).to(self.start[0])
+        factors = label_factors(samples.labels, config.occupied_share).to(self.start[0])
         steps_left = (config.epochs - self.epoch) * -(-count // batch_size)
         total_steps = self.step + steps_left
         for rows in batches(count, batch_size, self.rng):
@@ -142,8 +142,7 @@ class TuningRun:
         chunks = samples.positions.split(MAX_BATCH)
         answer = torch.cat([self.log_odds(chunk, *current) for chunk in chunks])
         labels = samples.labels.to(answer.dtype)
-        factors = class_factors(labels, 0.5).to(answer)[labels.long()]
-        return float(logistic_loss(answer, labels, factors)) / len(answer)
+        return float(logistic_loss(answer, labels, balance_classes(labels))) / len(answer)
 
     def keep_best(self, loss: float) -> None:
         """Note the loss of the epoch, and its parameters if no epoch was better."""

@@ -83,20 +83,30 @@ def deal_samples(
     return tuple(torch.empty_like(column).index_copy_(0, place, column) for column in columns)
 
 
-def class_factors(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
-    """(N,) labels -> (2,) loss factors of a free and an occupied point, so that classes share the loss.
+def class_factors(free: Tensor, occupied: Tensor, occupied_share: float = 0.5) -> Tensor:
+    """(2,) loss factors of a free and an occupied point, so that the classes share the loss.
 
     Over all points they have mean 1. With a single class present both are 1.
+
+    Args:
+        free: () how many points are free, or what they count.
+        occupied: () the same of the occupied points.
+        occupied_share: of the loss.
     """
-    occupied = labels.sum().double()
-    free = len(labels) - occupied
-    balanced = len(labels) * torch.stack([(1 - occupied_share) / free, occupied_share / occupied])
+    total = free + occupied
+    balanced = total * torch.stack([(1 - occupied_share) / free, occupied_share / occupied])
     return torch.where((occupied > 0) & (free > 0), balanced, torch.ones_like(balanced))
+
+
+def label_factors(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
+    """(N,) labels -> (2,) `class_factors`, float64."""
+    occupied = labels.sum().double()
+    return class_factors(len(labels) - occupied, occupied, occupied_share)
 
 
 def balance_classes(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
     """(N,) labels -> (N,) loss factors, see `class_factors`."""
-    return class_factors(labels, occupied_share).to(labels)[labels.long()]
+    return label_factors(labels, occupied_share).to(labels)[labels.long()]
 
 
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:

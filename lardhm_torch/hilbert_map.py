@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from lardhm_torch import checkpoint, joining, map_state, native, uncertainty
-from lardhm_torch.clustering import Clusters, cluster_classes, factor_covariances, z_order
+from lardhm_torch.clustering import Clusters, along_curve, cluster_classes, factor_covariances
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.incremental import Task, UpdateConfig, updated
@@ -284,7 +284,7 @@ class LardHilbertMap(nn.Module):
         dtype = self.centers.dtype
         rng = torch.Generator(device=points.device).manual_seed(seed)
         origin = points.mean(dim=0, dtype=torch.float64).round()
-        local, labels = _along_curve(to_frame(points, origin, dtype), labels.to(dtype))
+        local, labels = along_curve(to_frame(points, origin, dtype), labels.to(dtype))
         clusters, is_occupied = cluster_classes(local, labels, num_clusters, rng)
         learned = LardHilbertMap(**self.settings).to(self.centers)
         learned._grow(clusters, is_occupied, origin)
@@ -493,12 +493,6 @@ class LardHilbertMap(nn.Module):
         if self.origin.dtype != torch.float64:
             self.origin = origin.to(self.origin.device)
         return self
-
-
-def _along_curve(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples in an order in which neighbors in space are neighbors in memory: all else is faster."""
-    order = z_order(points)
-    return points.index_select(0, order), labels.index_select(0, order)
 
 
 def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:

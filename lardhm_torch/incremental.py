@@ -18,12 +18,14 @@ from lardhm_torch import native
 from lardhm_torch.clustering import (
     MIN_COUNT,
     Clusters,
+    along_curve,
     cluster_classes,
     cluster_points,
     clusters_about,
     factor_covariances,
+    points_where,
+    split_classes,
     split_clusters,
-    z_order,
 )
 from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig
@@ -114,9 +116,8 @@ def updated(
     known = state.rows(nearby)
     classes = split_classes(points, labels > 0.5)
     if task.config.as_in_paper:
-        order = z_order(points)
-        sorted_samples = (points.index_select(0, order), labels.index_select(0, order))
-        new, is_occupied = cluster_classes(*sorted_samples, num_clusters, task.rng)
+        points, labels = along_curve(points, labels)
+        new, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
         part = merge_clusters(
             known, new, is_occupied, task.config.zeta, task.kernel.min_lengthscale
         )
@@ -127,19 +128,6 @@ def updated(
             if total:
                 part = absorb(part, members, kind, total, task)
     return nearby, _train(part, known, classes, task)
-
-
-def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
-    """Occupied and free points; views where the occupied ones come first, as from `sample_rays`."""
-    count = int(is_occupied.sum())
-    if bool(is_occupied[:count].all()):
-        return [points[:count], points[count:]]
-    return [points_where(points, is_occupied), points_where(points, ~is_occupied)]
-
-
-def points_where(points: Tensor, mask: Tensor) -> Tensor:
-    """``points[mask]``, twice as fast."""
-    return points.index_select(0, mask.nonzero().squeeze(1))
 
 
 def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -> MapState:
@@ -186,7 +174,7 @@ def absorb(
     rest = points_where(points, look.unexplained)
     if len(rest) < MIN_COUNT:
         return part
-    rest = rest.index_select(0, z_order(rest))
+    (rest,) = along_curve(rest)
     share = -(-num_clusters * len(rest) // len(points))
     new = cluster_points(rest, share, task.rng)
     new, where = _settle(known, new, look, task)

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import MIN_COUNT, factor_covariances, z_order
+from lardhm_torch.clustering import MIN_COUNT, factor_covariances, spread_rows, z_order
 from lardhm_torch.features import Kernel
-from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
+from lardhm_torch.fitting import FitConfig, class_factors, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
 from lardhm_torch.native.update import explain, ordered_features
 
@@ -40,17 +40,14 @@ class Evidence:
         return len(self.points)
 
 
-def spread_rows(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
+def spread_points(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
     """(count, D) of the points, one from each of as many equal stretches; all if there are no more.
 
     Points of one ray follow each other, so that all rays get their share.
     """
     if count >= len(points):
         return points
-    place = torch.rand(count, generator=rng, device=rng.device, dtype=torch.float64)
-    place += torch.arange(count, device=rng.device)
-    rows = (place * (len(points) / count)).long().clamp_(max=len(points) - 1)
-    return points.index_select(0, rows)
+    return points.index_select(0, spread_rows(len(points), count, rng))
 
 
 def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> list[Evidence]:
@@ -66,7 +63,7 @@ def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> lis
     parts = []
     for number, label in enumerate((1.0, 0.0)):
         members, other = classes[number], classes[1 - number]
-        points = spread_rows(members, max(limit // 2, limit - len(other)), rng)
+        points = spread_points(members, max(limit // 2, limit - len(other)), rng)
         labels = points.new_full((len(points),), label)
         strength = torch.full_like(labels, len(members) / max(1, len(points)))
         parts.append(Evidence(points, labels, labels > 0.5, strength))
@@ -114,7 +111,7 @@ def contradicted(
         return worth
     own = known.rows(occupied)
     factors = factor_covariances(own.clusters.covariances, floor)
-    drawn = [spread_rows(points, limit, rng) for points in classes]
+    drawn = [spread_points(points, limit, rng) for points in classes]
     hits, passes = (explain(part, own.means, factors, INSIDE, INSIDE)[1] for part in drawn)
     # in units of hits, as if both classes had one total
     passes *= len(classes[0]) / len(drawn[1])
@@ -210,11 +207,9 @@ def learn(
     )
     total, occupied = strength.sum(), (strength * is_occupied).sum()
     counts = strength * (len(evidence) / total)
-    if config.balance and bool((occupied > 0) & (occupied < total)):
-        own = config.occupied_share
-        counts *= torch.where(
-            is_occupied, own * total / occupied, (1 - own) * total / (total - occupied)
-        )
+    if config.balance:
+        factors = class_factors(total - occupied, occupied, config.occupied_share)
+        counts *= factors.to(counts)[is_occupied.long()]
     scaled = replace(config, l2=config.l2 * len(evidence) / float(total))
 
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:

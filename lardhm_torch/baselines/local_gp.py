@@ -18,7 +18,7 @@ from lardhm_torch.baselines.gaussian_process import (
     squared_exponential,
     squash,
 )
-from lardhm_torch.clustering import mini_batch_kmeans, z_order
+from lardhm_torch.clustering import along_curve, mini_batch_kmeans
 from lardhm_torch.hilbert_map import check_samples
 from lardhm_torch.native import nearest_centers
 
@@ -76,8 +76,7 @@ class LocalGP:
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
         origin = points.mean(dim=0).round()
         local = (points - origin).to(self.dtype)
-        order = z_order(local)
-        local, targets = local[order], 2 * labels[order].to(self.dtype) - 1
+        local, targets = along_curve(local, 2 * labels.to(self.dtype) - 1)
         centers = mini_batch_kmeans(local, max(1, len(local) // self.points_per_cluster), rng)
         members = _members(local, centers, rng)
         centers = centers[

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch.clustering import z_order
+from lardhm_torch.clustering import along_curve
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.hilbert_map import check_samples
 
@@ -75,8 +75,7 @@ class OriginalHilbertMap:
         self.offsets = self._neighbor_offsets(points.shape[1]).to(points.device)
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
 
-        order = z_order(points)
-        samples = points[order], labels[order].to(self.dtype)
+        samples = along_curve(points, labels.to(self.dtype))
         points, labels = deal_samples(samples, self.config.rows_a_batch(len(points)), rng)
 
         def features_of(rows: slice) -> tuple[Tensor, Tensor]:

@@ -6,6 +6,7 @@
 #include <tuple>
 #include <vector>
 
+#include "moments.h"
 #include "sorting.h"
 #include "tensors.h"
 
@@ -15,12 +16,11 @@ namespace {
 // k = 1: the own center of every point, and the moments of the offsets from it.
 template <class T, int D>
 struct AssignVisitor final : Visitor<T, D> {
-  static constexpr int kMoments = 1 + D + D * (D + 1) / 2;
   const int32_t* order;
   const T* positions;
   bool scatter;
   int64_t* labels;  // may be null
-  double* sums;  // (M, kMoments) by rank: count, offsets, lower triangle of their products
+  double* sums;  // (M, kMoments<D>) by rank
 
   AssignVisitor(const Parameters<T, D>& parameters, bool scatter_, int64_t* labels_, double* sums_)
       : order(parameters.index.order), positions(parameters.positions.data), scatter(scatter_),
@@ -39,66 +39,24 @@ struct AssignVisitor final : Visitor<T, D> {
         if (labels) labels[packet.row(lane)] = order[rank];
         T offset[D];
         for (int d = 0; d < D; ++d) offset[d] = packet.x[d][lane] - center[d];
-        add(offset, sums + rank * kMoments);
+        add_moments<T, D>(offset, scatter, sums + rank * kMoments<D>);
       }
     }
-  }
-
-  void add(const T* offset, double* to) const {
-    to[0] += 1;
-    for (int d = 0; d < D; ++d) to[1 + d] += offset[d];
-    if (!scatter) return;
-    double* product = to + 1 + D;
-    for (int i = 0; i < D; ++i)
-      for (int j = 0; j <= i; ++j) *product++ += double(offset[i]) * double(offset[j]);
   }
 };
 
 // Moments of n points by the rank of their nearest center, in as many parts as are worth it.
 template <class T, int D>
-struct MomentSums {
-  static constexpr int kMoments = AssignVisitor<T, D>::kMoments;
-  const Index& index;
-  int64_t parts;
-  std::vector<double> sums;
-
-  MomentSums(const T* points, int64_t n, const T* centers, const Index& index_, bool scatter,
-             int64_t* labels)
-      : index(index_) {
-    Parameters<T, D> parameters(index, centers, nullptr, nullptr, {},
-                                n >= index.header.count / kPointsOfFew);
-    const int64_t size = index.header.count * kMoments;
-    parts = parts_of(n, size * sizeof(double), parameters);
-    sums.resize(size * parts);
-    visit_parts<T, D>(points, n, parameters, 1, parts, [&](int64_t part) {
-      return std::make_unique<AssignVisitor<T, D>>(parameters, scatter, labels,
-                                                   sums.data() + part * size);
-    });
-  }
-
-  // The first `moments` of one center.
-  void total(int64_t rank, int moments, double* sum) const {
-    for (int i = 0; i < moments; ++i) sum[i] = 0;
-    for (int64_t part = 0; part < parts; ++part)
-      for (int i = 0; i < moments; ++i)
-        sum[i] += sums[(part * index.header.count + rank) * kMoments + i];
-  }
-};
-
-// Sums of the parts as tensors: counts, offsets, symmetric scatters.
-template <class T, int D>
-void scatter_moments(const MomentSums<T, D>& moments, T* counts, T* offsets, T* scatters) {
-  for (int64_t rank = 0; rank < moments.index.header.count; ++rank) {
-    double sum[MomentSums<T, D>::kMoments];
-    moments.total(rank, MomentSums<T, D>::kMoments, sum);
-    const int64_t row = moments.index.order[rank];
-    counts[row] = T(sum[0]);
-    for (int d = 0; d < D; ++d) offsets[row * D + d] = T(sum[1 + d]);
-    const double* product = sum + 1 + D;
-    for (int i = 0; scatters && i < D; ++i)
-      for (int j = 0; j <= i; ++j, ++product)
-        scatters[(row * D + i) * D + j] = scatters[(row * D + j) * D + i] = T(*product);
-  }
+MomentParts<D> moments_of(const T* points, int64_t n, const T* centers, const Index& index,
+                          bool scatter, int64_t* labels) {
+  const int64_t count = index.header.count;
+  Parameters<T, D> parameters(index, centers, nullptr, nullptr, {}, n >= count / kPointsOfFew);
+  const int64_t bytes = count * kMoments<D> * sizeof(double);
+  MomentParts<D> moments(count, parts_of(n, bytes, parameters));
+  visit_parts<T, D>(points, n, parameters, 1, moments.parts, [&](int64_t part) {
+    return std::make_unique<AssignVisitor<T, D>>(parameters, scatter, labels, moments.part(part));
+  });
+  return moments;
 }
 
 using Moments = std::tuple<Tensor, Tensor, Tensor, Tensor>;
@@ -118,10 +76,10 @@ Moments assign(const Tensor& given_points, const Tensor& given_centers, const Te
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     const CallIndex<T, dim()> call(index, in<T>(centers), count);
-    const MomentSums<T, dim()> moments(in<T>(points), n, in<T>(centers), call.index, scatter,
-                                       out<int64_t>(std::get<0>(result)));
-    scatter_moments<T, dim()>(moments, out<T>(std::get<1>(result)), out<T>(std::get<2>(result)),
-                              scatter ? out<T>(std::get<3>(result)) : nullptr);
+    const auto moments = moments_of<T, dim()>(in<T>(points), n, in<T>(centers), call.index, scatter,
+                                              out<int64_t>(std::get<0>(result)));
+    moments.write(call.index.order, out<T>(std::get<1>(result)), out<T>(std::get<2>(result)),
+                  scatter ? out<T>(std::get<3>(result)) : nullptr);
     return 0;
   });
   return result;
@@ -145,7 +103,8 @@ void pull_centers(const std::vector<T>& batch, T* centers, int64_t count, std::v
     return bytes.data;
   });
   const Index index = view_of(bytes.data);
-  const MomentSums<T, D> moments(batch.data(), batch.size() / D, centers, index, false, nullptr);
+  const auto moments =
+      moments_of<T, D>(batch.data(), batch.size() / D, centers, index, false, nullptr);
   for (int64_t rank = 0; rank < count; ++rank) {
     double sum[1 + D];
     moments.total(rank, 1 + D, sum);

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <limits>
 #include <tuple>
+#include <vector>
 
 #include "occupancy.h"
 #include "tensors.h"
@@ -10,7 +11,8 @@
 namespace lardhm {
 namespace {
 
-// Neighbors of each point, ascending by row of the centers, and their kernel values where asked.
+// Neighbors of each point, ascending by row of the centers, and their kernel values where asked;
+// written to the place of the point in another order where one is given.
 template <class T, int D, class Integer>
 struct NeighborVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
@@ -19,20 +21,26 @@ struct NeighborVisitor final : Visitor<T, D> {
   int64_t k;
   Integer* rows;
   T* values;  // may be null
+  const int32_t* places;  // may be null
 
-  NeighborVisitor(const Parameters<T, D>& parameters, int64_t k_, Integer* rows_, T* values_)
+  NeighborVisitor(const Parameters<T, D>& parameters, int64_t k_, Integer* rows_, T* values_,
+                  const int32_t* places_)
       : order(parameters.index.order), positions(parameters.positions.data),
-        shapes(parameters.shapes.data), k(k_), rows(rows_), values(values_) {}
+        shapes(parameters.shapes.data), k(k_), rows(rows_), values(values_), places(places_) {}
+
+  int64_t first_of(int64_t row) const { return (places ? int64_t(places[row]) : row) * k; }
 
   void invalid(int64_t row) override {
+    const int64_t first = first_of(row);
     for (int64_t j = 0; j < k; ++j) {
-      rows[row * k + j] = Integer(j);
-      if (values) values[row * k + j] = std::numeric_limits<T>::quiet_NaN();
+      rows[first + j] = Integer(j);
+      if (values) values[first + j] = std::numeric_limits<T>::quiet_NaN();
     }
   }
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
-    int64_t filled[Simd<T>::W] = {};
+    int64_t filled[Simd<T>::W] = {}, first[Simd<T>::W];
+    for (int lane = 0; lane < packet.lanes; ++lane) first[lane] = first_of(packet.row(lane));
     for (int64_t j = 0; j < selected.size; ++j) {
       const int64_t rank = selected.rank[j];
       T value[Simd<T>::W];
@@ -45,7 +53,7 @@ struct NeighborVisitor final : Visitor<T, D> {
       }
       for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
-        insert(packet.row(lane) * k, filled[lane]++, Integer(order[rank]), value[lane]);
+        insert(first[lane], filled[lane]++, Integer(order[rank]), value[lane]);
       }
     }
   }
@@ -103,38 +111,74 @@ Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t 
     Parameters<T, dim()> parameters(call.index, in<T>(centers), nullptr, nullptr, {},
                                     n >= centers.size(0) / kPointsOfFew);
     visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
-      return std::make_unique<NeighborVisitor<T, dim(), int64_t>>(parameters, k,
-                                                                  out<int64_t>(rows), nullptr);
+      return std::make_unique<NeighborVisitor<T, dim(), int64_t>>(
+          parameters, k, out<int64_t>(rows), nullptr, nullptr);
     });
     return 0;
   });
   return rows;
 }
 
-std::tuple<Tensor, Tensor> nearest_features(const Tensor& given_points, const Tensor& centers,
-                                            const Tensor& raw, const Tensor& index, int64_t k,
-                                            double covariance_scale, double min_lengthscale) {
+// Where each row comes to stand in an order of n rows.
+std::vector<int32_t> places_of(const Tensor& order, int64_t n) {
+  STD_TORCH_CHECK(order.scalar_type() == ScalarType::Long && order.numel() == n &&
+                      n < (int64_t(1) << 31),
+                  "order must be int64 and hold every row of the points once");
+  std::vector<int32_t> place(n, -1);
+  const int64_t* row = in<int64_t>(order);
+  for (int64_t i = 0; i < n; ++i) {
+    STD_TORCH_CHECK(row[i] >= 0 && row[i] < n && place[row[i]] < 0,
+                    "order must hold every row of the points once");
+    place[row[i]] = int32_t(i);
+  }
+  return place;
+}
+
+// Neighbors and kernel values of all points, row by row or, if `ordered`, those of the points in the
+// order given.
+std::tuple<Tensor, Tensor> features_in_order(const Tensor& given_points, const Tensor& given_order,
+                                             const Tensor& centers, const Tensor& raw,
+                                             const Tensor& index, int64_t k, const Scaling& scaling,
+                                             bool ordered) {
   check_k(k);
   const Tensor points = tidy(given_points);
   check_rows("points", points, centers);
   const Tensor weights = torch::stable::new_zeros(centers, {centers.size(0)});
-  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  const MapTensors map(centers, raw, weights, index, scaling.covariance_scale,
+                       scaling.min_lengthscale);
   k = std::min(k, centers.size(0));
   const int64_t n = points.size(0);
   const Tensor rows = torch::stable::new_empty(points, {n, k}, ScalarType::Int);
   const Tensor values = torch::stable::new_empty(points, {n, k});
   if (k == 0) return {rows, values};
+  std::vector<int32_t> places;
+  if (ordered) places = places_of(tidy(given_order), n);
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     with_parameters<T, dim()>(map, n, [&](Parameters<T, dim()>& parameters) {
       visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
         return std::make_unique<NeighborVisitor<T, dim(), int32_t>>(
-            parameters, k, out<int32_t>(rows), out<T>(values));
+            parameters, k, out<int32_t>(rows), out<T>(values), ordered ? places.data() : nullptr);
       });
     });
     return 0;
   });
   return {rows, values};
+}
+
+std::tuple<Tensor, Tensor> nearest_features(const Tensor& points, const Tensor& centers,
+                                            const Tensor& raw, const Tensor& index, int64_t k,
+                                            double covariance_scale, double min_lengthscale) {
+  const Scaling scaling{covariance_scale, min_lengthscale};
+  return features_in_order(points, points, centers, raw, index, k, scaling, false);
+}
+
+std::tuple<Tensor, Tensor> ordered_features(const Tensor& points, const Tensor& order,
+                                            const Tensor& centers, const Tensor& raw,
+                                            const Tensor& index, int64_t k,
+                                            double covariance_scale, double min_lengthscale) {
+  const Scaling scaling{covariance_scale, min_lengthscale};
+  return features_in_order(points, order, centers, raw, index, k, scaling, true);
 }
 
 // Log-odds of an empty map: 0, and NaN where a coordinate is not finite.
@@ -220,6 +264,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
       "nearest_features(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
       "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
   m.def(
+      "ordered_features(Tensor points, Tensor order, Tensor centers, Tensor raw_scale_tril, "
+      "Tensor index, int k, float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
+  m.def(
       "occupancy(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor weights, int k, "
       "float covariance_scale, float min_lengthscale, Tensor index, bool probability) -> Tensor");
   m.def(
@@ -233,6 +280,7 @@ STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
   m.impl("index_matches", TORCH_BOX(&lardhm::index_matches));
   m.impl("nearest", TORCH_BOX(&lardhm::nearest));
   m.impl("nearest_features", TORCH_BOX(&lardhm::nearest_features));
+  m.impl("ordered_features", TORCH_BOX(&lardhm::ordered_features));
   m.impl("occupancy", TORCH_BOX(&lardhm::occupancy));
   m.impl("lattice_occupancy", TORCH_BOX(&lardhm::lattice_occupancy));
 }

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lardhm_torch.clustering import factor_covariances, z_order
+from lardhm_torch.clustering import along_curve, factor_covariances
 from lardhm_torch.features import raw_factors
 from lardhm_torch.files import replaced_file
 from lardhm_torch.fitting import FitConfig
@@ -194,8 +194,7 @@ class _Job:
             records = records[records["kind"] < HALO]
         shift = self._corner(index) - self._origin(index)
         tile = unpack(records, self.device, self.empty.centers.dtype, shift)
-        order = z_order(tile.points)
-        return TilePoints(*(column.index_select(0, order) for column in tile))
+        return TilePoints(*along_curve(*tile))
 
     def _around(self, index: Index) -> TileClusters:
         """The neighbors' clusters within two halos, in the frame of a tile."""

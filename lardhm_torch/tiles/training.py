@@ -23,12 +23,12 @@ from lardhm_torch.clustering import (
     MIN_COUNT,
     POINTS_PER_CLUSTER,
     Clusters,
-    cluster_points,
+    cluster_each,
     concatenate_clusters,
     factor_covariances,
 )
 from lardhm_torch.features import Kernel, raw_factors
-from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
+from lardhm_torch.fitting import FitConfig, class_factors, deal_samples, fit_weights
 from lardhm_torch.tiles.samples import Counts, TilePoints
 
 # Clusters of best accuracy lie denser where points do, but less so: where there are twice the
@@ -70,11 +70,11 @@ def make_budget(tiles: Mapping[Any, Counts], config: FitConfig) -> Budget:
         total / max(1.0, sum(counts[kind] ** power for counts in tiles.values()))
         for kind, power in enumerate(DENSITY_POWERS)
     ]
-    factors = (1.0, 1.0)
-    if config.balance and hits and free:
-        share, points = config.occupied_share, hits + free
-        factors = ((1 - share) * points / free, share * points / hits)
-    return Budget((units[0], units[1]), factors)
+    factors = torch.ones(2, dtype=torch.double)
+    if config.balance:
+        counts = torch.tensor([free, hits], dtype=torch.double)
+        factors = class_factors(counts[0], counts[1], config.occupied_share)
+    return Budget((units[0], units[1]), (float(factors[0]), float(factors[1])))
 
 
 class TileClusters(NamedTuple):
@@ -94,13 +94,8 @@ def cluster_tile(
         num_clusters: of the occupied and of the free points.
         rng: random state.
     """
-    parts = []
-    for label, total in zip((1, 0), num_clusters, strict=True):
-        members = tile.points[tile.in_core & (tile.labels == label)]
-        if len(members):
-            parts.append((cluster_points(members, total, rng), bool(label)))
-    kinds = [torch.full_like(found.counts, kind, dtype=torch.bool) for found, kind in parts]
-    return TileClusters(concatenate_clusters([found for found, _ in parts]), torch.cat(kinds))
+    classes = [tile.points[tile.in_core & (tile.labels == label)] for label in (1, 0)]
+    return TileClusters(*cluster_each(classes, num_clusters, rng))
 
 
 def train_tile(

@@ -24,7 +24,12 @@ from lardhm_torch import (
 from lardhm_torch.baselines.local_gp import LocalGP
 from lardhm_torch.baselines.octomap import OctoMapBaseline, to_array
 from lardhm_torch.baselines.original_hilbert_map import OriginalHilbertMap
-from lardhm_torch.clustering import clusters_about, factor_covariances, mini_batch_kmeans, z_order
+from lardhm_torch.clustering import (
+    along_curve,
+    clusters_about,
+    factor_covariances,
+    mini_batch_kmeans,
+)
 from lardhm_torch.features import raw_factors
 from lardhm_torch.fitting import deal_samples, fit_weights
 
@@ -85,8 +90,7 @@ def _stages(local: Tensor, labels: Tensor, grid: Tensor, seed: int) -> dict[str,
         took[name] = took.get(name, 0.0) + time.perf_counter() - start
         return result
 
-    order = timed("clustering", lambda: z_order(local))
-    local, labels = timed("clustering", lambda: (local[order], labels[order]))
+    local, labels = timed("clustering", lambda: along_curve(local, labels))
     parts = []
     for members in (local[labels > 0.5], local[labels <= 0.5]):
         count = NUM_CLUSTERS // 2
