@@ -197,10 +197,7 @@ class LardHilbertMap(nn.Module):
         Returns:
             (len(axes[0]), len(axes[1]), ...) without gradient.
         """
-        if len(axes) != self.dim:
-            raise ValueError(f"axes must be {self.dim} lists of coordinates; got {len(axes)}")
-        if not all(bool(axis.isfinite().all()) for axis in axes):
-            raise ValueError("axes must be finite; got NaN or infinity")
+        check_axes(axes, self.dim)
         local = [
             to_frame(axis, shift, self.centers.dtype)
             for axis, shift in zip(axes, self.origin, strict=True)
@@ -237,11 +234,7 @@ class LardHilbertMap(nn.Module):
 
     def _to_map_frame(self, points: Tensor) -> Tensor:
         points = torch.as_tensor(points, device=self.origin.device)
-        if points.ndim == 0 or points.shape[-1] != self.dim:
-            raise ValueError(
-                f"points must be (..., {self.dim}), one row of coordinates per point; "
-                f"got {tuple(points.shape)}"
-            )
+        check_points(points, self.dim)
         return to_frame(points, self.origin, self.centers.dtype)
 
     # --- how the map learns ---
@@ -493,6 +486,23 @@ class LardHilbertMap(nn.Module):
         if self.origin.dtype != torch.float64:
             self.origin = origin.to(self.origin.device)
         return self
+
+
+def check_points(points: Tensor, dim: int) -> None:
+    """A ValueError where points are not (..., D)."""
+    if points.ndim == 0 or points.shape[-1] != dim:
+        raise ValueError(
+            f"points must be (..., {dim}), one row of coordinates per point; "
+            f"got {tuple(points.shape)}"
+        )
+
+
+def check_axes(axes: Sequence[Tensor], dim: int) -> None:
+    """A ValueError where axes are not D lists of finite coordinates."""
+    if len(axes) != dim:
+        raise ValueError(f"axes must be {dim} lists of coordinates; got {len(axes)}")
+    if not all(bool(axis.isfinite().all()) for axis in axes):
+        raise ValueError("axes must be finite; got NaN or infinity")
 
 
 def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:

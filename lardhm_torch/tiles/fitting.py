@@ -10,7 +10,6 @@ the job is killed; called again, it goes on.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import os
 import shutil
@@ -45,6 +44,7 @@ from lardhm_torch.tiles.manifest import (
     tile_name,
     tile_path,
     tile_record,
+    touching_tiles,
     write_manifest,
 )
 from lardhm_torch.tiles.ranks import Ranks, join_ranks, one_thread
@@ -209,8 +209,7 @@ class _Job:
 
     def _neighbors(self, index: Index) -> Iterator[Index]:
         """The tiles that touch one, in order."""
-        for step in itertools.product((-1, 0, 1), repeat=len(index)):
-            near = tuple(i + s for i, s in zip(index, step, strict=True))
+        for near in touching_tiles(index):
             if near != index and self.ledger.tiles.get(near, Counts()).core:
                 yield near
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import shutil
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from lardhm_torch.tiles.manifest import (
     read_manifest,
     samples_path,
     tile_path,
+    touching_tiles,
     write_manifest,
 )
 from lardhm_torch.tiles.samples import Counts, Ledger, read_ledger, record_type, write_ledger
@@ -128,12 +128,10 @@ class _Source:
             if index not in others and clusters_path(self.folder, ours).is_file():
                 shutil.copyfile(clusters_path(self.folder, ours), clusters_path(goal, index))
             entry = self.manifest.tiles.get(ours)
-            around = itertools.product((-1, 0, 1), repeat=len(index))
-            near = (tuple(i + s for i, s in zip(index, step, strict=True)) for step in around)
             if (
                 entry is not None
                 and tile_path(self.folder, ours).is_file()
-                and others.isdisjoint(near)
+                and others.isdisjoint(touching_tiles(index))
             ):
                 shutil.copyfile(tile_path(self.folder, ours), tile_path(goal, index))
                 entries[index] = entry

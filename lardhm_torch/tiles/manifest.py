@@ -8,10 +8,11 @@ spans ``origin + edge * i`` to ``origin + edge * (i + 1)``, and its name is its 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,12 @@ def tile_indices(points: Tensor, origin: Any, edge: float) -> Tensor:
     points = torch.as_tensor(points)
     origin = torch.as_tensor(origin, dtype=torch.float64, device=points.device)
     return ((points.double() - origin) / edge).floor().long()
+
+
+def touching_tiles(index: Index) -> Iterator[Index]:
+    """A tile and those that touch it, in order."""
+    for step in itertools.product((-1, 0, 1), repeat=len(index)):
+        yield tuple(i + s for i, s in zip(index, step, strict=True))
 
 
 def tile_record(model: Any, path: str | os.PathLike[str], num_points: int) -> Tile:

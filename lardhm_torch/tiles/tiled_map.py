@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import uncertainty
-from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.hilbert_map import LardHilbertMap, check_axes, check_points
 from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number, shifted
 from lardhm_torch.tiles.layout import (
     block_box,
@@ -159,10 +159,7 @@ class TiledMap:
     @torch.no_grad()
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
         """As `LardHilbertMap.query_lattice`, block by block."""
-        if len(axes) != self.dim:
-            raise ValueError(f"axes must be {self.dim} lists of coordinates; got {len(axes)}")
-        if not all(bool(axis.isfinite().all()) for axis in axes):
-            raise ValueError("axes must be finite; got NaN or infinity")
+        check_axes(axes, self.dim)
         shape, silent = [len(axis) for axis in axes], 0.5 if probability else 0.0
         result = torch.full(shape, silent, dtype=self._store.dtype, device=self._store.device)
         for place in lattice_parts(axes, self._layout.origin, self._layout.block_edge):
@@ -223,11 +220,7 @@ class TiledMap:
     ) -> Tensor:
         """Answers of the blocks' maps at (..., D) points; ``silent`` where no tile speaks."""
         points = torch.as_tensor(points, device=self._store.device)
-        if points.ndim == 0 or points.shape[-1] != self.dim:
-            raise ValueError(
-                f"points must be (..., {self.dim}), one row of coordinates per point; "
-                f"got {tuple(points.shape)}"
-            )
+        check_points(points, self.dim)
         flat = points.reshape(-1, self.dim)
         result = torch.full((len(flat),), silent, dtype=self._store.dtype, device=flat.device)
         keeps_graph = torch.is_grad_enabled() and flat.requires_grad
