@@ -18,6 +18,7 @@ from lardhm_torch.native import nearest_centers
 POINTS_PER_CLUSTER = 15  # of the rule that chooses the number of clusters, where points are sparse
 DENSE_POINTS = 35  # the same where they are dense, or clusters would fit the noise of the hits
 CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] of the cells that tell the two apart, and how
+CELLS_PER_SCAN_CLUSTER = 1  # the same where more scans will follow: a single one shows less
 MAX_CHOSEN = 5000  # a class
 START_POINTS = 50  # a center, drawn at random, among which the start is chosen
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
@@ -131,22 +132,33 @@ def concatenate_clusters(parts: list[Clusters]) -> Clusters:
     )
 
 
-def split_clusters(class_sizes: list[int], num_clusters: int | None) -> list[int]:
+def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
     """How many clusters each of the two classes gets.
 
     Half each, the odd one to the occupied class; a class that cannot fill its half (five points a
-    cluster) leaves the rest to the other. ``None``: as many as `choose_num_clusters` gives at most,
-    which is right for a single scan of a place that others will fill up.
+    cluster) leaves the rest to the other.
     """
     room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
-    if num_clusters is None:
-        finest = (class_sizes[0] or class_sizes[1]) // POINTS_PER_CLUSTER
-        return [min(max(1, finest), MAX_CHOSEN, space) for space in room]
     occupied = min(room[0], max(-(-num_clusters // 2), num_clusters - room[1]))
     return [occupied, min(room[1], num_clusters - occupied)]
 
 
-def choose_num_clusters(points: Tensor) -> int:
+def scan_clusters(classes: list[Tensor]) -> list[int]:
+    """How many clusters of each class a scan makes in a place that the map does not know.
+
+    As many as `choose_num_clusters` gives, but finer: other scans will fill the place up. Only where
+    points are so dense that they share a cell with dozens of others are clusters coarser than
+    `POINTS_PER_CLUSTER` asks for.
+
+    Args:
+        classes: (N, D) occupied and (F, D) free positions [m].
+    """
+    chosen = choose_num_clusters(classes[0] if len(classes[0]) else classes[1], fine=True)
+    rooms = [max(1, len(members) // MIN_COUNT) if len(members) else 0 for members in classes]
+    return [min(chosen, room) for room in rooms]
+
+
+def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
     """How many clusters `fit` makes of a class with these occupied points; of the free one as many.
 
     One for every `CELLS_PER_CLUSTER` cells with points in them, so that clusters are as fine as the
@@ -156,12 +168,15 @@ def choose_num_clusters(points: Tensor) -> int:
 
     Args:
         points: (N, D) positions [m].
+        fine: one for every `CELLS_PER_SCAN_CLUSTER` cells instead.
     """
     cells = (points / CELL_EDGE).floor().long()
     strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
-    count = len((cells * strides).sum(dim=1).unique())
+    # neighbors mostly follow each other: what is left to sort is a fraction of the points
+    count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
+    count //= CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER
     finest, coarsest = len(points) // POINTS_PER_CLUSTER, len(points) // DENSE_POINTS
-    return max(1, min(max(count // CELLS_PER_CLUSTER, coarsest), finest, MAX_CHOSEN))
+    return max(1, min(max(count, coarsest), finest, MAX_CHOSEN))
 
 
 def mini_batch_kmeans(

@@ -24,6 +24,7 @@ from lardhm_torch.clustering import (
     clusters_about,
     factor_covariances,
     points_where,
+    scan_clusters,
     split_classes,
     split_clusters,
 )
@@ -36,10 +37,12 @@ from lardhm_torch.replay import (
     around,
     contradicted,
     forget,
+    hit_clusters,
     join_evidence,
     learn,
     new_evidence,
     recalled_evidence,
+    spread_points,
 )
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
@@ -121,17 +124,40 @@ def updated(
         part = merge_clusters(
             known, new, is_occupied, task.config.zeta, task.kernel.min_lengthscale
         )
+        hit = hit_clusters(known, classes[0], task.kernel.min_lengthscale)
     else:
-        part = known
+        part, hit = _grown(known, classes, num_clusters, task)
+    return nearby, _train(part, known, classes, hit, task)
+
+
+def _grown(
+    known: MapState, classes: list[Tensor], num_clusters: int | None, task: Task
+) -> tuple[MapState, Tensor]:
+    """(Known clusters with the new points pooled into them, and new ones; which known ones were hit)."""
+    if num_clusters is None:
+        totals = scan_clusters(classes)
+    else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
-        for kind, members, total in zip((True, False), classes, totals, strict=True):
-            if total:
-                part = absorb(part, members, kind, total, task)
-    return nearby, _train(part, known, classes, task)
+    part, hit = known, torch.zeros_like(known.is_occupied)
+    for kind, members, total in zip((True, False), classes, totals, strict=True):
+        if total:
+            part, met = absorb(part, members, kind, total, task)
+            hit = hit.index_fill(0, met, True) if kind else hit
+    return part, hit
 
 
-def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -> MapState:
-    """Weights trained on the new points and on what the clusters around them recall."""
+def _train(
+    part: MapState, known: MapState, classes: list[Tensor], hit: Tensor, task: Task
+) -> MapState:
+    """Weights trained on the new points and on what the clusters around them recall.
+
+    Args:
+        part: what the clusters nearby become, new ones at the end.
+        known: what they were.
+        classes: occupied and free new points [m].
+        hit: (Q,) which known clusters hits fell into.
+        task: kernel, settings, random state.
+    """
     config, kernel, rng = task.config, task.kernel, task.rng
     index = native.build_index(part.centers, kernel.num_neighbors)
     new = new_evidence(classes, config.max_points, rng)
@@ -143,7 +169,8 @@ def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -
     moving = around(changed, part.centers, kernel.num_neighbors, index)
     rows = moving[: len(known)].nonzero().squeeze(1)
     looked_at = LOOKED_AT * config.max_points
-    worth = contradicted(known, classes, looked_at, kernel.min_lengthscale, rng)
+    passed = spread_points(classes[1], looked_at, rng)
+    worth = contradicted(known, hit, len(classes[0]), passed, kernel.min_lengthscale)
     strength = known.counts.clamp(max=config.memory).to(worth).minimum(worth)[rows]
     strength = (strength / config.replay)[:, None].expand(-1, config.replay)
     old = recalled_evidence(known, rows, kernel, strength, rng)
@@ -155,7 +182,7 @@ def _train(part: MapState, known: MapState, classes: list[Tensor], task: Task) -
 
 def absorb(
     part: MapState, points: Tensor, is_occupied: bool, num_clusters: int, task: Task
-) -> MapState:
+) -> tuple[MapState, Tensor]:
     """Points of one class pooled into the clusters that explain them; the others make new ones.
 
     Args:
@@ -164,6 +191,9 @@ def absorb(
         is_occupied: which class.
         num_clusters: how many all the points would make; the unexplained make their share.
         task: kernel, settings, random state.
+
+    Returns:
+        (what becomes of ``part``, new clusters at its end; rows of those that points fell into).
     """
     floor = task.kernel.min_lengthscale
     own = (part.is_occupied == is_occupied).nonzero().squeeze(1)
@@ -171,15 +201,16 @@ def absorb(
     look = _explain(known, points, len(points) / num_clusters, task)
     pooled = (look.found.counts > 0).nonzero().squeeze(1)
     part = pool_into(part, own[pooled], take_clusters(look.found, pooled), floor)
+    met = torch.cat([own[pooled], own[look.outgrown]])
     rest = points_where(points, look.unexplained)
     if len(rest) < MIN_COUNT:
-        return part
+        return part, met
     (rest,) = along_curve(rest)
     share = -(-num_clusters * len(rest) // len(points))
     new = cluster_points(rest, share, task.rng)
     new, where = _settle(known, new, look, task)
     kinds = torch.full((len(new),), is_occupied, device=points.device)
-    return append_clusters(part, new, kinds, floor, own[where])
+    return append_clusters(part, new, kinds, floor, own[where]), met
 
 
 class _Look(NamedTuple):

@@ -90,8 +90,23 @@ def recalled_evidence(
     return Evidence(points, labels, is_occupied.reshape(-1), strength.reshape(-1))
 
 
+def hit_clusters(known: MapState, hits: Tensor, floor: float) -> Tensor:
+    """(M,) bool: occupied clusters that (N, D) hits lie in."""
+    found = torch.zeros_like(known.is_occupied)
+    occupied = known.is_occupied.nonzero().squeeze(1)
+    if len(occupied) == 0 or len(hits) == 0:
+        return found
+    return found.index_copy_(0, occupied, _points_inside(known.rows(occupied), hits, floor) > 0)
+
+
+def _points_inside(known: MapState, points: Tensor, floor: float) -> Tensor:
+    """(M,) how many (N, D) points lie in each of M clusters, each point in its nearest at most."""
+    factors = factor_covariances(known.clusters.covariances, floor)
+    return explain(points, known.means, factors, INSIDE, INSIDE)[1]
+
+
 def contradicted(
-    known: MapState, classes: list[Tensor], limit: int, floor: float, rng: torch.Generator
+    known: MapState, hit: Tensor, num_hits: int, passed: Tensor, floor: float
 ) -> Tensor:
     """(M,) how many points of an occupied cluster's past a scan leaves it; elsewhere infinity.
 
@@ -100,22 +115,18 @@ def contradicted(
 
     Args:
         known: M clusters.
-        classes: (N, D) occupied and (N, D) free points of the scan [m].
-        limit: how many points of each class are looked at.
+        hit: (M,) which of them hits of the scan fell into.
+        num_hits: of the scan.
+        passed: (N, D) free points of the scan, or some of them that stand for all [m].
         floor: smallest standard deviation [m].
-        rng: random state of which points are looked at.
     """
     worth = torch.full_like(known.weights, torch.inf)
     occupied = known.is_occupied.nonzero().squeeze(1)
-    if len(occupied) == 0 or not all(map(len, classes)):
+    if len(occupied) == 0 or num_hits == 0 or len(passed) == 0:
         return worth
-    own = known.rows(occupied)
-    factors = factor_covariances(own.clusters.covariances, floor)
-    drawn = [spread_points(points, limit, rng) for points in classes]
-    hits, passes = (explain(part, own.means, factors, INSIDE, INSIDE)[1] for part in drawn)
-    # in units of hits, as if both classes had one total
-    passes *= len(classes[0]) / len(drawn[1])
-    denied = (passes > 0) & (hits == 0)
+    passes = _points_inside(known.rows(occupied), passed, floor)
+    passes *= num_hits / len(passed)  # in units of hits, as if both classes had one total
+    denied = (passes > 0) & ~hit[occupied]
     return worth.index_copy_(0, occupied, passes.where(denied, torch.inf))
 
 

@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from lardhm_torch import checkpoint
-from lardhm_torch.clustering import split_clusters
+from lardhm_torch.clustering import scan_clusters, split_classes
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.incremental import UpdateConfig
 from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
@@ -173,6 +173,6 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
 def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
     if config.max_clusters is None:
         return config.num_clusters
-    hits = int(samples.labels.sum())
-    chosen = config.num_clusters or sum(split_clusters([hits, len(samples) - hits], None))
+    classes = split_classes(samples.points, samples.labels > 0.5)
+    chosen = config.num_clusters or sum(scan_clusters(classes))
     return min(chosen, config.max_clusters)

@@ -164,9 +164,6 @@ def test_classes_are_clustered_apart_occupied_first():
         ([20, 1000], 100, [4, 96]),
         ([1000, 0], 100, [100, 0]),
         ([3, 3], 500, [1, 1]),
-        ([1500, 8000], None, [100, 100]),
-        ([1500, 300], None, [100, 60]),
-        ([0, 300], None, [0, 20]),
     ],
 )
 def test_clusters_are_split_over_the_classes(sizes, asked, given_out):

@@ -19,7 +19,7 @@ from lardhm_torch.clustering import cluster_points, factor_covariances
 from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState
 from lardhm_torch.merging import match_clusters, merge_clusters
-from lardhm_torch.replay import contradicted, forget
+from lardhm_torch.replay import contradicted, forget, hit_clusters
 
 F64 = torch.float64
 PAPER = UpdateConfig(as_in_paper=True, replay=0)
@@ -394,12 +394,13 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     clusters = cluster_points(points[:600], 8, rng)
     known = state_of(clusters, torch.arange(len(clusters)) % 2 > 0)
     hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
-    worth = contradicted(known, [hits, free], 10_000, 0.01, rng)
-    assert torch.equal(worth.isfinite(), known.is_occupied)
-    as_often = contradicted(known, [free, free], 10_000, 0.01, rng)
-    assert not as_often.isfinite().any()
-    nothing = contradicted(known, [hits[:0], free], 10_000, 0.01, rng)
-    assert not nothing.isfinite().any()
+    passed = contradicted(known, hit_clusters(known, hits, 0.01), len(hits), free, 0.01)
+    assert torch.equal(passed.isfinite(), known.is_occupied)
+    met = hit_clusters(known, free, 0.01)
+    assert torch.equal(met, known.is_occupied)
+    assert not contradicted(known, met, len(free), free, 0.01).isfinite().any()
+    no_hits = hit_clusters(known, hits[:0], 0.01)
+    assert not contradicted(known, no_hits, 0, free, 0.01).isfinite().any()
 
 
 # --- real scans ---

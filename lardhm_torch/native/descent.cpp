@@ -67,6 +67,7 @@ void add_gradient_for(const Rows<T>& rows, int64_t begin, int64_t end, const T* 
     case 5: return add_gradient<T, 5>(rows, begin, end, weights, slope);
     case 8: return add_gradient<T, 8>(rows, begin, end, weights, slope);
     case 12: return add_gradient<T, 12>(rows, begin, end, weights, slope);
+    case 16: return add_gradient<T, 16>(rows, begin, end, weights, slope);
     default: return add_gradient<T, 0>(rows, begin, end, weights, slope);
   }
 }

@@ -11,8 +11,9 @@
 namespace lardhm {
 namespace {
 
-// Neighbors of each point, ascending by row of the centers, and their kernel values where asked;
-// written to the place of the point in another order where one is given.
+// Neighbors of each point, ascending by row of the centers, and their kernel values where asked. Where
+// another order of the points is given they go to the point's place in it and are not sorted: sorting
+// would take longer than all else here, and who sums over them all does not need it.
 template <class T, int D, class Integer>
 struct NeighborVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
@@ -53,7 +54,13 @@ struct NeighborVisitor final : Visitor<T, D> {
       }
       for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
-        insert(first[lane], filled[lane]++, Integer(order[rank]), value[lane]);
+        const int64_t n = filled[lane]++;
+        if (places) {
+          rows[first[lane] + n] = Integer(order[rank]);
+          values[first[lane] + n] = value[lane];
+        } else {
+          insert(first[lane], n, Integer(order[rank]), value[lane]);
+        }
       }
     }
   }
@@ -135,7 +142,7 @@ std::vector<int32_t> places_of(const Tensor& order, int64_t n) {
 }
 
 // Neighbors and kernel values of all points, row by row or, if `ordered`, those of the points in the
-// order given.
+// order given, each point's own unsorted.
 std::tuple<Tensor, Tensor> features_in_order(const Tensor& given_points, const Tensor& given_order,
                                              const Tensor& centers, const Tensor& raw,
                                              const Tensor& index, int64_t k, const Scaling& scaling,

@@ -83,7 +83,8 @@ def ordered_features(
 ) -> tuple[Tensor, Tensor]:
     """`native.nearest_features` of ``points[order]``, searched in the order of the points.
 
-    Neighbors that follow each other are found faster than those far apart, as in batches.
+    Neighbors that follow each other are found faster than those far apart, as in batches. The columns
+    of a row come in any order, the same for indices and values.
 
     Args:
         points: (N, D) positions [m].
