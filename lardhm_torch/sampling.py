@@ -117,12 +117,13 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     rays = keep.nonzero().squeeze(1)
     # the starts of a single scan are one point: gathering them for every ray would take longest
     starts = scans.origins[:1] if scans.num_scans == 1 else scans.ray_origins[rays]
-    offsets = scans.ends[rays] - starts
+    offsets = _taken(scans.ends, rays) - starts
     ranges = torch.linalg.vector_norm(offsets, dim=1)
-    is_hit = scans.is_return[rays] & (ranges <= config.max_range)
+    is_hit = _taken(scans.is_return, rays) & (ranges <= config.max_range)
     reach = ranges.clamp(max=config.max_range)
     free_end = torch.where(is_hit, (reach - config.near_margin).clamp(min=0), reach)
-    first = scans.target_index[rays] == 1
+    first = _taken(scans.target_index, rays) == 1
+    ahead = offsets / ranges[:, None]
     rng = torch.Generator(device=ranges.device).manual_seed(seed)
     groups = [
         _stratified_depths(first, free_end, config.free_samples, rng),
@@ -131,15 +132,17 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     hits = is_hit.nonzero().squeeze(1)
     count = len(hits) + sum(depths.numel() for _, depths in groups)
     points, ray_id = ranges.new_empty(count, scans.dim), hits.new_empty(count)
-    points[: len(hits)], ray_id[: len(hits)] = scans.ends[rays[hits]], rays[hits]
+    hit_rays = _taken(rays, hits)
+    points[: len(hits)], ray_id[: len(hits)] = _taken(scans.ends, hit_rays), hit_rays
     begin = len(hits)
     for members, depths in groups:  # written in place: on a full scan a million points
         rows = slice(begin, begin := begin + depths.numel())
-        start = starts if scans.num_scans == 1 else starts[members]
-        ahead = offsets[members] / ranges[members, None]
-        block = points[rows].view(*depths.shape, scans.dim)
-        torch.addcmul(start[:, None], depths[:, :, None], ahead[:, None], out=block)
-        ray_id[rows].view_as(depths).copy_(rays[members, None])
+        start = starts if scans.num_scans == 1 else _taken(starts, members)
+        along, block = _taken(ahead, members), points[rows].view(*depths.shape, scans.dim)
+        for axis in range(scans.dim):  # three times as fast as all axes at once
+            column = slice(axis, axis + 1)
+            torch.addcmul(start[:, column], depths, along[:, column], out=block[..., axis])
+        ray_id[rows].view_as(depths).copy_(_taken(rays, members)[:, None])
     labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
     return Samples(points, labels, ray_id, dropped)
@@ -153,7 +156,7 @@ def _stratified_depths(
     shape = (len(members), count)
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
     depths += torch.arange(count, device=rng.device)
-    return members, depths.mul_((free_end[members] / count)[:, None])
+    return members, depths.mul_((_taken(free_end, members) / count)[:, None])
 
 
 def _near_depths(
@@ -164,7 +167,12 @@ def _near_depths(
     shape = (len(members), config.near_samples)
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
     depths *= config.near_margin - config.near_reach
-    return members, depths.add_(free_end[members, None]).clamp_(min=0)
+    return members, depths.add_(_taken(free_end, members)[:, None]).clamp_(min=0)
+
+
+def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
+    """``tensor[rows]`` of rows that ascend: the tensor itself, not copied, where they are all."""
+    return tensor if len(rows) == len(tensor) else tensor.index_select(0, rows)
 
 
 def check_samples(
