@@ -212,7 +212,7 @@ def mini_batch_kmeans(
     """
     batch_size = min(len(points), batch_size or 10 * num_clusters)
     centers = _stratified_start(points, num_clusters, rng)
-    rows = torch.stack([spread_rows(len(points), batch_size, rng) for _ in range(iterations)])
+    rows = spread_rows(len(points), batch_size, rng, iterations)
     if native.supports(points):
         return torch.ops.lardhm.kmeans(points, centers, rows, batch_size, restart_every)
     met = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
@@ -249,9 +249,10 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
 
 
-def spread_rows(num_points: int, count: int, rng: torch.Generator) -> Tensor:
-    """(count,) random rows of N, ascending, one from each of as many equal stretches; count <= N."""
-    place = torch.rand(count, generator=rng, device=rng.device, dtype=torch.double)
+def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) -> Tensor:
+    """(*times, count) random rows of N, ascending, one from each of ``count`` <= N equal stretches."""
+    shape = (*times, count)
+    place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
     place += torch.arange(count, device=rng.device)
     return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
