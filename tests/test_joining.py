@@ -55,6 +55,26 @@ def test_a_moved_map_of_real_scans_answers_as_before(data, name, dtype, toleranc
     torch.testing.assert_close(there, before, atol=tolerance, rtol=0)
 
 
+@torch.no_grad()
+def test_moving_a_float32_map_adds_no_more_than_rounding_the_points_once_does(data):
+    # The move itself is in float64, and the origin takes up the translation: what is left is the
+    # rounding of points, centers and factors to float32, here on the widest scans.
+    scans = load_scans(data / "kitti00_mulls" / "scans.npz")
+    samples = sample_rays(scans.select(torch.arange(0, len(scans), 40)))
+    model = LardHilbertMap().fit(samples.points, samples.labels)
+    turn, shift = rotation(3, 1), torch.tensor([1003.0, 993.0, 1000.4], dtype=F64)
+    points = samples.points[::10]
+    there = points @ turn.T + shift
+    before = model.log_odds(points)
+    moved = model.transform(turn, shift)
+    change = (moved.log_odds(there) - before).double()
+    exact = copy.deepcopy(moved).double()
+    rounded = (there - moved.origin).float().double() + moved.origin
+    by_rounding = exact.log_odds(rounded) - exact.log_odds(there)
+    assert 0 < change.square().mean() < 2**2 * by_rounding.square().mean()
+    assert change.abs().max() < 2 * by_rounding.abs().max()
+
+
 def test_moving_there_and_back_leaves_the_map_as_it_was():
     model, turn = wall_map(), rotation(3, 0)
     shift = torch.tensor([3.2, -7.7, 0.4], dtype=F64)
