@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.files import replaced_file
-from lardhm_torch.tiles.reach import cluster_reach
+from lardhm_torch.tiles.reach import largest_reach
 
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
@@ -176,7 +176,7 @@ def tile_record(model: Any, path: str | os.PathLike[str], num_points: int) -> Ti
         num_points=int(num_points),
         num_clusters=len(model),
         bounds=(tuple(corners[0]), tuple(corners[1])),
-        reach=float(cluster_reach(model.weights, model.scale_tril).max()),
+        reach=largest_reach(model.weights, model.scale_tril),
     )
 
 
