@@ -16,7 +16,7 @@ from lardhm_torch.segments import Mover, expected_range, segment_hazard
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
 from lardhm_torch.tiles.manifest import tile_indices, tile_path, write_manifest
-from lardhm_torch.tiles.store import cluster_bytes, joined
+from lardhm_torch.tiles.store import cluster_bytes, joined, state_of
 
 TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
 both = pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -45,7 +45,7 @@ def test_answers_at_borders_are_those_of_the_merged_map(
 ):
     tiles = tiled(random_map(1, dim, dtype), tmp_path, monkeypatch, block_clusters)
     assert len(tiles.manifest.tiles) > 10
-    assert tiles._layout.block_tiles < 4
+    assert tiles._parts.layout.block_tiles < 4
     assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 5_000))
 
 
@@ -86,7 +86,7 @@ def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 300)
     for dtype in (torch.float32, F64):
         tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 15.0)
-        assert tiles._layout.block_tiles < 4
+        assert tiles._parts.layout.block_tiles < 4
         assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 100_000))
 
 
@@ -137,8 +137,8 @@ def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, mon
         model.raw_scale_tril[0].diagonal().fill_(3.0)  # 20 m, in a map of 20 m
     tiles = tiled(model, tmp_path, monkeypatch)
     point = torch.full((3,), 110.0, dtype=F64)
-    assert tiles._layout.reach.max() > 100
-    assert len(needed_tiles(tiles._layout, point, point)) < len(tiles.manifest.tiles) / 2
+    assert tiles._parts.layout.reach.max() > 100
+    assert len(needed_tiles(tiles._parts.layout, point, point)) < len(tiles.manifest.tiles) / 2
     torch.testing.assert_close(tiles.log_odds(point), tiles.merge().log_odds(point))
 
 
@@ -282,7 +282,7 @@ def test_posteriors_learned_apart_are_none_of_the_whole(tmp_path, monkeypatch):
     first, second = (random_map().fit_uncertainty(points, labels) for labels in answers)
     assert not torch.equal(first.posterior_scales, second.posterior_scales)
     with pytest.raises(RuntimeError, match="variance needs the posterior"):
-        joined([first, second], model.settings, model.origin).variance(points)
+        joined([state_of(first), state_of(second)], model.settings, model.origin).variance(points)
 
 
 def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
@@ -294,8 +294,12 @@ def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
     expected = model(points)
     for some in points.split(20):
         tiles(some)
-        held = sum(m.centers.numel() for m, _ in tiles._cache._entries.values()) // 3
-        assert held * cluster_bytes(3, F64) == tiles._cache.num_bytes
+        cache = tiles._parts.cache
+        kept = [
+            state_of(m) if isinstance(m, LardHilbertMap) else m for m, _ in cache._entries.values()
+        ]
+        held = sum(len(state["weights"]) for state in kept)
+        assert held * cluster_bytes(3, F64) == cache.num_bytes
         assert held <= 2200
     torch.testing.assert_close(tiles(points), expected)
 

@@ -9,7 +9,7 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState, assign_state
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.manifest import tile_path, tile_record, write_manifest
-from lardhm_torch.tiles.store import joined
+from lardhm_torch.tiles.store import joined, state_of
 
 F64 = torch.float64
 EDGE = 6.0
@@ -46,7 +46,9 @@ def reframed(tiles):
     for index, tile in tiles.manifest.tiles.items():
         path = tile_path(tiles.folder, index)
         model = LardHilbertMap.load(path)
-        joined([model], model.settings, model.origin + 3.0 + EDGE * torch.tensor(index)).save(path)
+        joined(
+            [state_of(model)], model.settings, model.origin + 3.0 + EDGE * torch.tensor(index)
+        ).save(path)
         entries[index] = tile_record(LardHilbertMap.load(path), path, tile.num_points)
     write_manifest(tiles.folder, replace(tiles.manifest, tiles=entries))
     return TiledMap.open(tiles.folder)
