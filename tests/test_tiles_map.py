@@ -295,10 +295,8 @@ def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
     for some in points.split(20):
         tiles(some)
         cache = tiles._parts.cache
-        kept = [
-            state_of(m) if isinstance(m, LardHilbertMap) else m for m, _ in cache._entries.values()
-        ]
-        held = sum(len(state["weights"]) for state in kept)
+        held = sum(len(state["weights"]) for state, _ in cache._tiles.values())
+        held += sum(len(part) for part, _ in cache._maps.values())
         assert held * cluster_bytes(3, F64) == cache.num_bytes
         assert held <= 2200
     torch.testing.assert_close(tiles(points), expected)

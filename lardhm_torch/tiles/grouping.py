@@ -14,7 +14,7 @@ SORTED_AT_ONCE = 1 << 19  # rows
 def rows_by_number(numbers: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
     """Each number >= 0 of (N,), once, with the rows that have it, ascending; a run is a slice.
 
-    A counting sort, some rows at a time: beside the numbers it holds four bytes a row.
+    A counting sort, some rows at a time, of four bytes a row.
 
     >>> dict(rows_by_number(torch.tensor([4, 4, -1, 2])))
     {2: slice(3, 4, None), 4: slice(0, 2, None)}
@@ -26,6 +26,7 @@ def rows_by_number(numbers: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
     counts = sum(torch.bincount(part + 1, minlength=size) for part in parts)
     ends = torch.as_tensor(counts).cumsum(0)
     order = _counting_sort(parts, ends - counts)
+    del numbers, parts  # the caller need not hold them while the groups are answered
     begin = int(counts[0])
     for number in counts[1:].nonzero().squeeze(1).tolist():
         rows = order[begin : int(ends[number + 1])]

@@ -70,12 +70,12 @@ class Parts:
 
     def whole(self) -> LardHilbertMap:
         """The map of all tiles, kept."""
-        model = self.cache.get("whole")
+        model = self.cache.map("whole")
         if model is None:
             rows = torch.arange(len(self.layout.indices))
             self._make_room(rows, "all clusters, which are asked for")
             model = self.cut(None)
-            self._keep("whole", model, len(model))
+            self.cache.put_map("whole", model)
         return model
 
     def pieces(self) -> Iterator[LardHilbertMap]:
@@ -87,7 +87,7 @@ class Parts:
     def _map_of(self, rows: Tensor, points: Tensor) -> LardHilbertMap:
         """One map of tiles (S,), kept; an error if one that the points' box needs is damaged."""
         key = ("joined", *rows.tolist())
-        model = self.cache.get(key)
+        model = self.cache.map(key)
         if model is None:
             self._make_room(rows, "the tiles that answer here")
             tiles, missing = [], {}
@@ -97,7 +97,7 @@ class Parts:
                 except DamagedTileError as error:
                     missing[row] = error
             model = self._joined(tiles)
-            self._keep(key, model, len(model))
+            self.cache.put_map(key, model)
             self._missing[key] = missing
         if self._missing[key]:
             corners = points.detach().double().cpu()
@@ -111,10 +111,10 @@ class Parts:
 
     def _tile(self, row: int) -> TileState:
         index = self.layout.indices[row]
-        state = self.cache.get(index)
+        state = self.cache.tile(index)
         if state is None:
             state = self.store.load(index)
-            self._keep(index, state, len(state["weights"]))
+            self.cache.put_tile(index, state)
         return state
 
     def _joined(self, tiles: list[TileState], origin: Tensor | None = None) -> LardHilbertMap:
@@ -136,21 +136,16 @@ class Parts:
         model = joined(tiles, self.store.manifest.settings, origin)
         return model.to(self.store.device, self.store.dtype)
 
-    def _keep(self, key: Any, value: Any, clusters: int) -> None:
-        self.cache.put(key, value, clusters * self._cluster_bytes())
-
-    def _cluster_bytes(self) -> int:
-        return cluster_bytes(len(self.origin), self.store.dtype)
-
     def _make_room(self, rows: Tensor, what: str) -> None:
         """Forget what is unused longest, so that these tiles and what they make fit the limit."""
         clusters = int(self.layout.counts[rows].sum())
-        needed = 2 * clusters * self._cluster_bytes()
+        bytes_each = cluster_bytes(len(self.origin), self.store.dtype)
+        needed = 2 * clusters * bytes_each
         if needed > self.cache.limit:
             raise ValueError(
                 f"memory_limit must be {needed} bytes or more to hold {what}; "
                 f"got {self.cache.limit}"
             )
-        there = [self.cache.get(self.layout.indices[row]) for row in rows.tolist()]
+        there = [self.cache.tile(self.layout.indices[row]) for row in rows.tolist()]
         clusters = 2 * clusters - sum(len(tile["weights"]) for tile in there if tile is not None)
-        self.cache.make_room(clusters * self._cluster_bytes())
+        self.cache.make_room(clusters * bytes_each)

@@ -34,32 +34,54 @@ class DamagedTileError(ValueError):
 
 
 class Cache:
-    """Maps and tiles by key, the latest used last; the others go when more is asked for than allowed."""
+    """Maps and tiles by key, up to so many bytes.
+
+    When more is asked for than allowed, tiles go first: they are in the maps that were made of them.
+    Of tiles, and then of maps, those unused longest go.
+    """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.num_bytes = 0
-        self._entries: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
+        self._tiles: OrderedDict[Hashable, tuple[TileState, int]] = OrderedDict()
+        self._maps: OrderedDict[Hashable, tuple[LardHilbertMap, int]] = OrderedDict()
 
-    def get(self, key: Hashable) -> Any | None:
-        """What is kept under this key, if it is still there."""
-        if key not in self._entries:
-            return None
-        self._entries.move_to_end(key)
-        return self._entries[key][0]
+    def tile(self, key: Hashable) -> TileState | None:
+        """The tile of this key, if it is still there."""
+        return _latest(self._tiles, key)
+
+    def map(self, key: Hashable) -> LardHilbertMap | None:
+        """The map of this key, if it is still there."""
+        return _latest(self._maps, key)
 
     def make_room(self, num_bytes: int) -> None:
-        """Forget what is unused longest until so much more fits."""
-        while self._entries and self.num_bytes + num_bytes > self.limit:
-            _, (_, freed) = self._entries.popitem(last=False)
-            self.num_bytes -= freed
+        """Forget until so much more fits."""
+        for entries in (self._tiles, self._maps):
+            while entries and self.num_bytes + num_bytes > self.limit:
+                _, (_, freed) = entries.popitem(last=False)
+                self.num_bytes -= freed
 
-    def put(self, key: Hashable, value: Any, num_bytes: int) -> None:
-        """Keep a map or a tile, if it fits at all."""
+    def put_tile(self, key: Hashable, state: TileState) -> None:
+        """Keep a tile, if it fits at all."""
+        self._put(self._tiles, key, state, state["centers"])
+
+    def put_map(self, key: Hashable, model: LardHilbertMap) -> None:
+        """Keep a map, if it fits at all."""
+        self._put(self._maps, key, model, model.centers)
+
+    def _put(self, entries: OrderedDict[Any, Any], key: Hashable, value: Any, rows: Tensor) -> None:
+        num_bytes = cluster_bytes(rows.shape[1], rows.dtype) * len(rows)
         self.make_room(num_bytes)
         if num_bytes <= self.limit:
-            self._entries[key] = (value, num_bytes)
+            entries[key] = (value, num_bytes)
             self.num_bytes += num_bytes
+
+
+def _latest(entries: OrderedDict[Any, Any], key: Hashable) -> Any | None:
+    if key not in entries:
+        return None
+    entries.move_to_end(key)
+    return entries[key][0]
 
 
 def cluster_bytes(dim: int, dtype: torch.dtype) -> int:

@@ -40,7 +40,7 @@ def read_tensors(content: bytearray) -> dict[str, Any] | None:
         state = _Unpickler(content, dict(_records(content))).load()
     except Exception:  # bytes that are no map file break in a dozen ways; torch's reader names it
         return None
-    return dict(state) if isinstance(state, OrderedDict) else None
+    return state if isinstance(state, dict) else None
 
 
 def _records(content: bytearray) -> Iterator[tuple[str, slice]]:

@@ -243,7 +243,9 @@ class TiledMap:
         nowhere = (numbers < 0).nonzero().squeeze(1)  # all that are not finite are among them
         for rows in nowhere.split(NUMBERS_AT_ONCE):
             result[rows[~flat[rows].isfinite().all(dim=1)]] = torch.nan
-        yield from rows_by_number(numbers)
+        groups = rows_by_number(numbers)
+        del numbers, nowhere
+        yield from groups
 
     @property
     def _dtype(self) -> torch.dtype:
