@@ -10,12 +10,13 @@ from lardhm_torch import LardHilbertMap, TiledMap, extract_mesh, raycast, sample
 from lardhm_torch.exploring import frontiers
 from lardhm_torch.io import load_scans
 from lardhm_torch.querying import map_bounds, occupancy_gradient, query_grid
-from lardhm_torch.rays import surface_step
 from lardhm_torch.scans import split_rays
-from lardhm_torch.segments import Mover, expected_range, segment_hazard
+from lardhm_torch.segments import expected_range, segment_hazard
+from lardhm_torch.surface import surface_step, thickness_counts
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
-from lardhm_torch.tiles.manifest import tile_indices, tile_path, write_manifest
+from lardhm_torch.tiles.manifest import write_manifest
+from lardhm_torch.tiles.places import tile_indices, tile_path
 from lardhm_torch.tiles.store import cluster_bytes, joined, state_of
 
 TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
@@ -233,9 +234,8 @@ def test_rays_end_where_they_do_in_the_merged_map(tmp_path, monkeypatch):
     rng = torch.Generator().manual_seed(0)
     origins = 100 + 20 * torch.rand(60, 3, generator=rng, dtype=F64)
     directions = torch.randn(60, 3, generator=rng, dtype=F64)
-    step = surface_step(single)
     for surface in ("peak", "crossing"):
-        options = {"max_range": 8.0, "step": step, "surface": surface}
+        options = {"max_range": 8.0, "surface": surface}
         expected = raycast(single, origins, directions, **options)
         assert 5 < expected.isfinite().sum() < 60
         torch.testing.assert_close(raycast(tiles, origins, directions, **options), expected)
@@ -244,20 +244,26 @@ def test_rays_end_where_they_do_in_the_merged_map(tmp_path, monkeypatch):
     assert raycast(tiles, origins + 1e5, directions, **unknown_stops).max() == 0
 
 
+def test_the_step_of_rays_is_that_of_the_merged_map_and_no_tile_is_read(tmp_path, monkeypatch):
+    tiles = tiled(random_map(clusters=600), tmp_path, monkeypatch)
+    single = tiles.merge()
+    for path in (tmp_path / "tiles" / "tiles").iterdir():
+        path.unlink()
+    assert tiles.thickness_counts() == thickness_counts(single)
+    assert surface_step(TiledMap.open(tiles.folder)) == surface_step(single)
+
+
 def test_segments_and_frontiers_are_those_of_the_merged_map(tmp_path, monkeypatch):
     tiles = tiled(random_map(), tmp_path, monkeypatch)
     single = tiles.merge()
     rng = torch.Generator().manual_seed(0)
     starts, ends = 100 + 20 * torch.rand(2, 20, 3, generator=rng, dtype=F64)
     starts.requires_grad_()
-    met = [segment_hazard(m, starts, ends, Mover(step=0.1)) for m in (tiles, single)]
+    met = [segment_hazard(m, starts, ends) for m in (tiles, single)]
     assert met[1].max() > 0
     torch.testing.assert_close(*met)
     torch.testing.assert_close(*(torch.autograd.grad(m.sum(), starts)[0] for m in met))
-    far = [
-        expected_range(m, starts.detach(), ends - 110, 4.0, Mover(step=0.2))
-        for m in (tiles, single)
-    ]
+    far = [expected_range(m, starts.detach(), ends - 110, 4.0) for m in (tiles, single)]
     torch.testing.assert_close(*far)
     found = [frontiers(m, [102] * 3, [107] * 3, 0.25) for m in (tiles, single)]
     assert torch.equal(found[0].points, found[1].points)

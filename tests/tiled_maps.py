@@ -8,7 +8,9 @@ from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState, assign_state
 from lardhm_torch.tiles import layout
-from lardhm_torch.tiles.manifest import tile_path, tile_record, write_manifest
+from lardhm_torch.tiles.entries import tile_record
+from lardhm_torch.tiles.manifest import write_manifest
+from lardhm_torch.tiles.places import tile_path
 from lardhm_torch.tiles.store import joined, state_of
 
 F64 = torch.float64

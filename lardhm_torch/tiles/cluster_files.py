@@ -19,7 +19,7 @@ from torch import Tensor
 
 from lardhm_torch.clustering import Clusters
 from lardhm_torch.files import replaced_file
-from lardhm_torch.tiles.manifest import Index, tile_name
+from lardhm_torch.tiles.places import Index, tile_name
 from lardhm_torch.tiles.training import TileClusters
 
 _HEAD_BYTES = 16

@@ -33,18 +33,15 @@ from lardhm_torch.tiles.cluster_files import (
     load_clusters_near,
     save_clusters,
 )
-from lardhm_torch.tiles.manifest import (
-    Index,
-    Manifest,
+from lardhm_torch.tiles.entries import (
     Tile,
     file_checksum,
-    read_manifest,
-    tile_name,
-    tile_path,
+    tile_from_json,
     tile_record,
-    touching_tiles,
-    write_manifest,
+    tile_to_json,
 )
+from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
+from lardhm_torch.tiles.places import Index, tile_name, tile_path, touching_tiles
 from lardhm_torch.tiles.ranks import Ranks, join_ranks, one_thread
 from lardhm_torch.tiles.samples import Counts, TilePoints, read_ledger, read_records, unpack
 from lardhm_torch.tiles.training import (
@@ -182,7 +179,7 @@ class _Job:
         model.cpu().save(path)
         record = tile_record(model, path, self.ledger.tiles[index].core)
         with replaced_file(self._fitted_path(index, ".json"), durable=False) as partial:
-            partial.write_text(json.dumps({"chunks": self.ledger.chunks, **vars(record)}))
+            partial.write_text(json.dumps({"chunks": self.ledger.chunks, **tile_to_json(record)}))
 
     def _points(self, index: Index) -> TilePoints:
         """A tile's points in the frame of its map."""
@@ -234,8 +231,7 @@ class _Job:
         fields = json.loads(path.read_text())
         if fields.pop("chunks") != self.ledger.chunks:
             return None
-        lower, upper = fields["bounds"]
-        return Tile(**{**fields, "bounds": (tuple(lower), tuple(upper))})
+        return tile_from_json(fields)
 
     def take_over(self, wanted: list[Index]) -> None:
         """Fitted tiles into the map; if killed within, the next call ends it."""

@@ -23,8 +23,8 @@ def rows_by_number(numbers: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
         return
     parts = numbers.split(SORTED_AT_ONCE)
     size = int(numbers.max()) + 2  # -1 is a number, too
-    counts = sum(torch.bincount(part + 1, minlength=size) for part in parts)
-    ends = torch.as_tensor(counts).cumsum(0)
+    counts = torch.stack([torch.bincount(part + 1, minlength=size) for part in parts]).sum(dim=0)
+    ends = counts.cumsum(dim=0)
     order = _counting_sort(parts, ends - counts)
     del numbers, parts  # the caller need not hold them while the groups are answered
     begin = int(counts[0])

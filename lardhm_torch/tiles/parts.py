@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.tiles.layout import block_box, layout_of, needed_tiles, speaking_blocks
-from lardhm_torch.tiles.manifest import tile_indices
+from lardhm_torch.tiles.places import tile_indices
 from lardhm_torch.tiles.store import (
     Cache,
     DamagedTileError,

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from lardhm_torch.clustering import points_where
 from lardhm_torch.files import replaced_file
-from lardhm_torch.tiles.manifest import Index, samples_path, tile_index, tile_name
+from lardhm_torch.tiles.places import Index, samples_path, tile_index, tile_name
 
 FORMAT_VERSION = 1
 LEDGER_NAME, LOCK_NAME = "samples.json", "samples.lock"

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.map_state import OF_THE_WHOLE
-from lardhm_torch.tiles.manifest import Index, Manifest, Tile, tile_name, tile_path
+from lardhm_torch.tiles.entries import Tile
+from lardhm_torch.tiles.manifest import Manifest
+from lardhm_torch.tiles.places import Index, tile_name, tile_path
 from lardhm_torch.tiles.tile_bytes import read_tensors
 
 TileState = dict[str, Tensor]  # the tensors of a tile's map by name

@@ -30,7 +30,7 @@ class _Storage(NamedTuple):
     """Numbers of one tensor: where they begin in the file, how many, of what kind."""
 
     begin: int
-    count: int
+    length: int
     dtype: torch.dtype
 
 
@@ -59,7 +59,7 @@ def _rebuild_tensor(
 ) -> tuple[_Storage, tuple[int, ...]]:
     """Stands in for `torch._utils._rebuild_tensor_v2`: whole contiguous tensors alone."""
     whole = [math.prod(size[axis + 1 :]) for axis in range(len(size))]
-    if offset != 0 or math.prod(size) != storage.count or list(stride) != whole:
+    if offset != 0 or math.prod(size) != storage.length or list(stride) != whole:
         raise pickle.UnpicklingError("a tensor that is a view of others")
     return storage, tuple(size)
 

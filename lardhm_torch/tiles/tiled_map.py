@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -160,6 +161,13 @@ class TiledMap:
                 model = self._parts.block(number, torch.stack(box))
                 result[place] = model.query_lattice(part, probability=probability)
         return result
+
+    def thickness_counts(self) -> Counter[int]:
+        """As `surface.thickness_counts` of the merged map, from the manifest alone."""
+        total: Counter[int] = Counter()
+        for tile in self.manifest.tiles.values():
+            total.update(tile.thickness_counts())
+        return total
 
     def pieces(self) -> Iterator[LardHilbertMap]:
         """The tiles' own maps, one after the other."""
