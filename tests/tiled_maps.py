@@ -14,7 +14,8 @@ from lardhm_torch.tiles.places import tile_path
 from lardhm_torch.tiles.store import joined, state_of
 
 F64 = torch.float64
-EDGE = 6.0
+EDGE = 7.0  # [m] of 3-D tiles: 27 of a random map
+FLAT_EDGE = 5.0  # [m] of 2-D ones: 16
 
 
 def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
@@ -36,10 +37,10 @@ def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
     return model
 
 
-def tiled(model, folder, monkeypatch, block_clusters=64):
+def tiled(model, folder, monkeypatch, block_clusters=64, edge=None):
     """The map in tiles, answered in blocks of few clusters, so that there are many."""
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", block_clusters)
-    return TiledMap.split(model, folder / "tiles", EDGE)
+    return TiledMap.split(model, folder / "tiles", edge or (EDGE if model.dim == 3 else FLAT_EDGE))
 
 
 def reframed(tiles):
