@@ -136,7 +136,7 @@ def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, mon
     model = random_map(3, clusters=4000)
     with torch.no_grad():
         model.raw_scale_tril[0].diagonal().fill_(3.0)  # 20 m, in a map of 20 m
-    tiles = tiled(model, tmp_path, monkeypatch, edge=5.0)
+    tiles = tiled(model, tmp_path, monkeypatch, edge=6.0)
     point = torch.full((3,), 110.0, dtype=F64)
     assert tiles._parts.layout.reach.max() > 100
     assert len(needed_tiles(tiles._parts.layout, point, point)) < len(tiles.manifest.tiles) / 2
