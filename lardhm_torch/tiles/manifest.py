@@ -26,7 +26,7 @@ from lardhm_torch.tiles.entries import (
 )
 from lardhm_torch.tiles.places import Index, tile_index, tile_name
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1 knew nothing of how thick clusters are
 MANIFEST_NAME = "manifest.json"
 DTYPES = ("float32", "float64")
 SETTINGS = ("dim", "num_neighbors", "covariance_scale", "min_lengthscale")
@@ -124,7 +124,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
         if version != FORMAT_VERSION or isinstance(version, bool):
             raise ValueError(
                 f"format_version must be {FORMAT_VERSION}; got {version!r}. "
-                "A newer map needs a newer lardhm_torch"
+                "A newer map needs a newer lardhm_torch; an older folder must be made anew"
             )
         body = page.get("map")
         if not isinstance(body, dict):
