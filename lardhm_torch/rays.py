@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lardhm_torch.bounding import Cells, ceiling_box, cover_cells, log_odds_ceiling
 from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, local_parts
+from lardhm_torch.surface import surface_step
 
 BISECTIONS = 16  # a step of 5 cm is narrowed down to below 1 µm
 STRIDE = 4  # steps of a block, which is asked as a whole
@@ -91,8 +92,9 @@ def raycast(
         directions: (R, D) of any length but 0.
         max_range: where to give up [m].
         threshold: probability of occupancy that counts as an obstacle, between 0 and 1.
-        step: [m]; an obstacle thinner than this can be missed. Left out: the median standard
-            deviation of the occupied clusters across their surface, a third of a wall or less.
+        step: [m]; an obstacle thinner than this can be missed. Left out: `surface_step`, the median
+            standard deviation of the occupied clusters across their surface, a third of a wall or
+            less.
         surface: "peak" or "crossing".
 
     Returns:
@@ -110,18 +112,11 @@ def raycast(
     origins, directions = unit_rays(model, origins, directions)
     result = origins.new_full((len(origins),), torch.inf)
     ends = origins + max_range * directions
+    step = min(surface_step(model) if step is None else step, max_range)
     for rows, part in local_parts(model, origins.minimum(ends), origins.maximum(ends)):
-        spacing = min(ray_step(model, part, max_range) if step is None else step, max_range)
-        rays = _Rays(origins[rows], directions[rows], spacing, max_range)
+        rays = _Rays(origins[rows], directions[rows], step, max_range)
         result[rows] = _raycast(part, rays, threshold, surface)
     return result
-
-
-def ray_step(model: Any, part: Any, max_range: float) -> float:
-    """Steps left out: `surface_step` of a part; any will do in one where there is no surface."""
-    if part is not model and not bool((part.weights > 0).any()):
-        return max_range
-    return surface_step(part)
 
 
 def _raycast(model: Any, rays: _Rays, threshold: float, surface: str) -> Tensor:
@@ -143,18 +138,6 @@ def _raycast(model: Any, rays: _Rays, threshold: float, surface: str) -> Tensor:
         result[met] = refine(model, rays, met, clear[met], level)
         parts.append(result)
     return torch.cat(parts) if parts else origins.new_zeros(0)
-
-
-def surface_step(model: Any) -> float:
-    """Median of the clusters' smallest standard deviation [m], of those that speak for occupied.
-
-    Raises:
-        ValueError: the map has no such cluster and so no surface.
-    """
-    factors = model.scale_tril[model.weights > 0].detach().double()
-    if len(factors) == 0:
-        raise ValueError("the map must hold a cluster of positive weight; got none: give a step")
-    return float(torch.linalg.svdvals(factors)[:, -1].median())
 
 
 def unit_rays(model: Any, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

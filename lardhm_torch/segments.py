@@ -22,7 +22,8 @@ from torch import Tensor
 
 from lardhm_torch.native import nearest_centers
 from lardhm_torch.querying import local_parts
-from lardhm_torch.rays import check_rays, ray_step, unit_rays
+from lardhm_torch.rays import check_rays, unit_rays
+from lardhm_torch.surface import surface_step
 
 HAZARD_LENGTH = 0.1  # [m] over which log-odds count once
 SHORTEST = (
@@ -103,8 +104,8 @@ def segment_hazard(model: Any, starts: Tensor, ends: Tensor, mover: Mover | None
     starts, ends = (x.to(model.origin.device, torch.float64) for x in (starts, ends))
     result = starts.new_zeros(len(starts))
     boxes = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
+    step = surface_step(model) / 2 if mover.step is None else mover.step
     for rows, part in local_parts(model, *boxes):
-        step = ray_step(model, part, 1.0) / 2 if mover.step is None else mover.step
         met = _segment_hazard(part, starts[rows], ends[rows], mover.radius, step)
         result = result.index_copy(0, rows, met / mover.length)
     return result
@@ -163,10 +164,9 @@ def expected_range(
     check_rays(model, origins, directions, max_range, mover.step)
     origins, directions = unit_rays(model, origins, directions)
     result, ends = origins.new_zeros(len(origins)), origins + max_range * directions
+    mover = replace(mover, step=surface_step(model) if mover.step is None else mover.step)
     for rows, part in local_parts(model, origins.minimum(ends), origins.maximum(ends)):
-        step = ray_step(model, part, max_range) if mover.step is None else mover.step
-        way = origins[rows], directions[rows], max_range
-        far = _expected_range(part, *way, replace(mover, step=step))
+        far = _expected_range(part, origins[rows], directions[rows], max_range, mover)
         result = result.index_copy(0, rows, far)
     return result
 

@@ -19,7 +19,8 @@ from lardhm_torch.metrics import evaluate, protocol_rays
 from lardhm_torch.tiles import fitting
 from lardhm_torch.tiles.cluster_files import clusters_path
 from lardhm_torch.tiles.fitting import fit_tiles
-from lardhm_torch.tiles.manifest import read_manifest, tile_path, write_manifest
+from lardhm_torch.tiles.manifest import read_manifest, write_manifest
+from lardhm_torch.tiles.places import tile_path
 from lardhm_torch.tiles.ranks import Ranks, one_thread
 from lardhm_torch.tiles.routing import TilingConfig, add_scans, tile_scans
 from lardhm_torch.tiles.samples import Counts, read_ledger

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -12,18 +13,15 @@ from hypothesis import strategies as st
 from tiled_maps import F64, border_points, random_map, tiled
 
 from lardhm_torch import LardHilbertMap, TiledMap, cli, save_scans, simulate_room
+from lardhm_torch.checkpoint import load_state
 from lardhm_torch.cli import main
+from lardhm_torch.tiles import grouping
+from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.grouping import rows_by_number
-from lardhm_torch.tiles.manifest import (
-    Manifest,
-    read_manifest,
-    tile_indices,
-    tile_name,
-    tile_path,
-    tile_record,
-    write_manifest,
-)
+from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
+from lardhm_torch.tiles.places import tile_indices, tile_name, tile_path
 from lardhm_torch.tiles.store import DamagedTileError
+from lardhm_torch.tiles.tile_bytes import read_tensors
 from lardhm_torch.tiles.tiled_map import open_map
 
 SETTINGS = LardHilbertMap().settings
@@ -139,6 +137,11 @@ def test_a_bad_field_is_named(field, value, message, tmp_path):
         ("bounds", [[0, 0, 1], [0, 0, 0]], "bounds must be lower <= upper"),
         ("bounds", [[0, 0], [1, 1]], "bounds of tile 3_-1_0 must have 3 coordinates"),
         ("bounds", [[0, 0, "x"], [1, 1, 1]], "must be coordinates in meters"),
+        ("thickness", [1, 2], r"thickness must be whole numbers; got \[1, 2\]"),
+        ("thickness", "-80 1.5", "thickness must be whole numbers; got '-80 1.5'"),
+        ("thickness", "-80", "thickness must be a bin and counts"),
+        ("thickness", "-80 -1", "thickness must be 0 or more; got -1"),
+        ("thickness", "5000 1", "thickness must be bins -4096 to 4096"),
     ],
 )
 def test_a_bad_field_of_a_tile_is_named(field, value, message, tmp_path):
@@ -154,10 +157,11 @@ def test_other_files_are_not_taken_for_a_manifest(tmp_path):
     for text, message in [
         ("", "must be JSON"),
         ("[" * 100_000, "must be JSON"),
-        ("[]", "format_version must be 1; got None"),
-        ('{"format_version": 2}', "got 2. A newer map needs a newer lardhm_torch"),
-        ('{"format_version": 1, "map": 3}', "map must be a table; got int"),
-        ('{"format_version": 1, "map": {}}', "the file was damaged or edited"),
+        ("[]", "format_version must be 2; got None"),
+        ('{"format_version": 3}', "got 3. A newer map needs a newer lardhm_torch"),
+        ('{"format_version": 1}', "got 1. .*an older folder must be made anew"),
+        ('{"format_version": 2, "map": 3}', "map must be a table; got int"),
+        ('{"format_version": 2, "map": {}}', "the file was damaged or edited"),
     ]:
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -247,16 +251,77 @@ def test_a_map_without_tiles_says_nothing(tmp_path):
     assert "0 tiles" in repr(tiles)
 
 
+# --- the bytes of tiles ---
+
+
+def tile_files(folder):
+    """Map files of both dtypes, saved in all ways, of one cluster and more, and an empty one."""
+    for number, (clusters, dtype) in enumerate([(0, F64), (1, F64), (7, torch.float32)]):
+        model = random_map(clusters=clusters, dtype=dtype) if clusters else LardHilbertMap()
+        model.save(folder / f"{number}.pt")
+        torch.save(model.state_dict(), folder / f"{number}_by_hand.pt")
+    return sorted(folder.glob("*.pt"))
+
+
+def test_tensors_are_read_from_bytes_as_torch_reads_them(tmp_path):
+    for path in tile_files(tmp_path):
+        ours, theirs = read_tensors(bytearray(path.read_bytes())), load_state(path)
+        assert ours.keys() == theirs.keys()
+        for name, value in theirs.items():
+            if isinstance(value, torch.Tensor):
+                assert ours[name].dtype == value.dtype
+                assert torch.equal(ours[name], value)
+            else:
+                assert ours[name] == value
+
+
+class Harm:
+    """What pickles as a call of a function."""
+
+    def __reduce__(self):
+        return os.mkdir, ("harmed",)
+
+
+def test_what_is_no_usual_map_file_is_left_to_torch_and_nothing_in_it_is_called(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    whole = torch.arange(6.0)
+    others = [{"weights": Harm()}, {"weights": whole[1:3]}, {"weights": whole.reshape(2, 3).T}, 3]
+    for number, other in enumerate([*others, {"weights": whole.half()}]):
+        torch.save(other, f"{number}.pt")
+        assert read_tensors(bytearray((tmp_path / f"{number}.pt").read_bytes())) is None
+    assert not (tmp_path / "harmed").exists()
+    assert read_tensors(bytearray(b"no zip file")) is None
+
+
+@settings(deadline=None, max_examples=150)
+@given(where=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255), cut=st.booleans())
+def test_damaged_bytes_are_never_an_error_of_another_kind(tmp_path_factory, where, flip, cut):
+    path = tmp_path_factory.mktemp("damaged") / "one.pt"
+    random_map(clusters=5).save(path)
+    content = bytearray(path.read_bytes())
+    place = int(where * len(content))
+    content[place] ^= flip
+    found = read_tensors(content[:place] if cut else content)
+    assert found is None or isinstance(found, dict)
+
+
 # --- groups of points ---
 
 
 @given(numbers=st.lists(st.integers(-1, 3), max_size=30))
 def test_every_row_is_in_the_group_of_its_number(numbers):
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setattr(grouping, "SORTED_AT_ONCE", 7)
     numbers = torch.tensor(numbers, dtype=torch.int32)
     seen = torch.full_like(numbers, -1)
     for number, rows in rows_by_number(numbers):
         assert (seen[rows] == -1).all()
         seen[rows] = number
+        order = torch.arange(len(numbers))[rows]
+        assert torch.equal(order, order.sort()[0])
+    monkeypatch.undo()
     assert torch.equal(seen, numbers)
 
 

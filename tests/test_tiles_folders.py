@@ -10,7 +10,8 @@ from lardhm_torch import LardHilbertMap, Scans, save_scans
 from lardhm_torch.cli import main
 from lardhm_torch.tiles.fitting import fit_tiles
 from lardhm_torch.tiles.folders import join_folders
-from lardhm_torch.tiles.manifest import read_manifest, tile_path, write_manifest
+from lardhm_torch.tiles.manifest import read_manifest, write_manifest
+from lardhm_torch.tiles.places import tile_path
 from lardhm_torch.tiles.routing import TilingConfig, tile_scans
 from lardhm_torch.tiles.samples import read_ledger
 from lardhm_torch.tiles.tiled_map import TiledMap

@@ -10,13 +10,14 @@ from lardhm_torch import LardHilbertMap, TiledMap, extract_mesh, raycast, sample
 from lardhm_torch.exploring import frontiers
 from lardhm_torch.io import load_scans
 from lardhm_torch.querying import map_bounds, occupancy_gradient, query_grid
-from lardhm_torch.rays import surface_step
 from lardhm_torch.scans import split_rays
-from lardhm_torch.segments import Mover, expected_range, segment_hazard
+from lardhm_torch.segments import expected_range, segment_hazard
+from lardhm_torch.surface import surface_step, thickness_counts
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
-from lardhm_torch.tiles.manifest import tile_indices, tile_path, write_manifest
-from lardhm_torch.tiles.store import cluster_bytes, joined
+from lardhm_torch.tiles.manifest import write_manifest
+from lardhm_torch.tiles.places import tile_indices, tile_path
+from lardhm_torch.tiles.store import cluster_bytes, joined, state_of
 
 TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
 both = pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -45,7 +46,7 @@ def test_answers_at_borders_are_those_of_the_merged_map(
 ):
     tiles = tiled(random_map(1, dim, dtype), tmp_path, monkeypatch, block_clusters)
     assert len(tiles.manifest.tiles) > 10
-    assert tiles._layout.block_tiles < 4
+    assert tiles._parts.layout.block_tiles < 4
     assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 5_000))
 
 
@@ -86,7 +87,7 @@ def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 300)
     for dtype in (torch.float32, F64):
         tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 15.0)
-        assert tiles._layout.block_tiles < 4
+        assert tiles._parts.layout.block_tiles < 4
         assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 100_000))
 
 
@@ -135,10 +136,10 @@ def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, mon
     model = random_map(3, clusters=4000)
     with torch.no_grad():
         model.raw_scale_tril[0].diagonal().fill_(3.0)  # 20 m, in a map of 20 m
-    tiles = tiled(model, tmp_path, monkeypatch)
+    tiles = tiled(model, tmp_path, monkeypatch, edge=6.0)
     point = torch.full((3,), 110.0, dtype=F64)
-    assert tiles._layout.reach.max() > 100
-    assert len(needed_tiles(tiles._layout, point, point)) < len(tiles.manifest.tiles) / 2
+    assert tiles._parts.layout.reach.max() > 100
+    assert len(needed_tiles(tiles._parts.layout, point, point)) < len(tiles.manifest.tiles) / 2
     torch.testing.assert_close(tiles.log_odds(point), tiles.merge().log_odds(point))
 
 
@@ -233,9 +234,8 @@ def test_rays_end_where_they_do_in_the_merged_map(tmp_path, monkeypatch):
     rng = torch.Generator().manual_seed(0)
     origins = 100 + 20 * torch.rand(60, 3, generator=rng, dtype=F64)
     directions = torch.randn(60, 3, generator=rng, dtype=F64)
-    step = surface_step(single)
     for surface in ("peak", "crossing"):
-        options = {"max_range": 8.0, "step": step, "surface": surface}
+        options = {"max_range": 8.0, "surface": surface}
         expected = raycast(single, origins, directions, **options)
         assert 5 < expected.isfinite().sum() < 60
         torch.testing.assert_close(raycast(tiles, origins, directions, **options), expected)
@@ -244,20 +244,26 @@ def test_rays_end_where_they_do_in_the_merged_map(tmp_path, monkeypatch):
     assert raycast(tiles, origins + 1e5, directions, **unknown_stops).max() == 0
 
 
+def test_the_step_of_rays_is_that_of_the_merged_map_and_no_tile_is_read(tmp_path, monkeypatch):
+    tiles = tiled(random_map(clusters=600), tmp_path, monkeypatch)
+    single = tiles.merge()
+    for path in (tmp_path / "tiles" / "tiles").iterdir():
+        path.unlink()
+    assert tiles.thickness_counts() == thickness_counts(single)
+    assert surface_step(TiledMap.open(tiles.folder)) == surface_step(single)
+
+
 def test_segments_and_frontiers_are_those_of_the_merged_map(tmp_path, monkeypatch):
     tiles = tiled(random_map(), tmp_path, monkeypatch)
     single = tiles.merge()
     rng = torch.Generator().manual_seed(0)
     starts, ends = 100 + 20 * torch.rand(2, 20, 3, generator=rng, dtype=F64)
     starts.requires_grad_()
-    met = [segment_hazard(m, starts, ends, Mover(step=0.1)) for m in (tiles, single)]
+    met = [segment_hazard(m, starts, ends) for m in (tiles, single)]
     assert met[1].max() > 0
     torch.testing.assert_close(*met)
     torch.testing.assert_close(*(torch.autograd.grad(m.sum(), starts)[0] for m in met))
-    far = [
-        expected_range(m, starts.detach(), ends - 110, 4.0, Mover(step=0.2))
-        for m in (tiles, single)
-    ]
+    far = [expected_range(m, starts.detach(), ends - 110, 4.0) for m in (tiles, single)]
     torch.testing.assert_close(*far)
     found = [frontiers(m, [102] * 3, [107] * 3, 0.25) for m in (tiles, single)]
     assert torch.equal(found[0].points, found[1].points)
@@ -282,7 +288,7 @@ def test_posteriors_learned_apart_are_none_of_the_whole(tmp_path, monkeypatch):
     first, second = (random_map().fit_uncertainty(points, labels) for labels in answers)
     assert not torch.equal(first.posterior_scales, second.posterior_scales)
     with pytest.raises(RuntimeError, match="variance needs the posterior"):
-        joined([first, second], model.settings, model.origin).variance(points)
+        joined([state_of(first), state_of(second)], model.settings, model.origin).variance(points)
 
 
 def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
@@ -294,8 +300,10 @@ def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
     expected = model(points)
     for some in points.split(20):
         tiles(some)
-        held = sum(m.centers.numel() for m, _ in tiles._cache._entries.values()) // 3
-        assert held * cluster_bytes(3, F64) == tiles._cache.num_bytes
+        cache = tiles._parts.cache
+        held = sum(len(state["weights"]) for state, _ in cache._tiles.values())
+        held += sum(len(part) for part, _ in cache._maps.values())
+        assert held * cluster_bytes(3, F64) == cache.num_bytes
         assert held <= 2200
     torch.testing.assert_close(tiles(points), expected)
 

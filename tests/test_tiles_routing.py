@@ -9,15 +9,10 @@ from room_tiles import CONFIG, EDGE, contents, room_folder, room_pieces
 
 from lardhm_torch import SamplingConfig, Scans, sample_rays
 from lardhm_torch.tiles import routing
-from lardhm_torch.tiles.manifest import read_manifest, samples_path, tile_indices
-from lardhm_torch.tiles.routing import (
-    Grid,
-    TilingConfig,
-    add_scans,
-    grid_origin,
-    route,
-    tile_scans,
-)
+from lardhm_torch.tiles.cutting import Grid, grid_origin, route
+from lardhm_torch.tiles.manifest import read_manifest
+from lardhm_torch.tiles.places import samples_path, tile_indices
+from lardhm_torch.tiles.routing import TilingConfig, add_scans, tile_scans
 from lardhm_torch.tiles.samples import Counts, read_ledger, read_records, unpack
 
 CPU = torch.device("cpu")

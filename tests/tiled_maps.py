@@ -8,11 +8,14 @@ from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
 from lardhm_torch.map_state import MapState, assign_state
 from lardhm_torch.tiles import layout
-from lardhm_torch.tiles.manifest import tile_path, tile_record, write_manifest
-from lardhm_torch.tiles.store import joined
+from lardhm_torch.tiles.entries import tile_record
+from lardhm_torch.tiles.manifest import write_manifest
+from lardhm_torch.tiles.places import tile_path
+from lardhm_torch.tiles.store import joined, state_of
 
 F64 = torch.float64
-EDGE = 6.0
+EDGE = 7.0  # [m] of 3-D tiles: 27 of a random map
+FLAT_EDGE = 5.0  # [m] of 2-D ones: 16
 
 
 def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
@@ -34,10 +37,10 @@ def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
     return model
 
 
-def tiled(model, folder, monkeypatch, block_clusters=64):
+def tiled(model, folder, monkeypatch, block_clusters=64, edge=None):
     """The map in tiles, answered in blocks of few clusters, so that there are many."""
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", block_clusters)
-    return TiledMap.split(model, folder / "tiles", EDGE)
+    return TiledMap.split(model, folder / "tiles", edge or (EDGE if model.dim == 3 else FLAT_EDGE))
 
 
 def reframed(tiles):
@@ -46,7 +49,9 @@ def reframed(tiles):
     for index, tile in tiles.manifest.tiles.items():
         path = tile_path(tiles.folder, index)
         model = LardHilbertMap.load(path)
-        joined([model], model.settings, model.origin + 3.0 + EDGE * torch.tensor(index)).save(path)
+        joined(
+            [state_of(model)], model.settings, model.origin + 3.0 + EDGE * torch.tensor(index)
+        ).save(path)
         entries[index] = tile_record(LardHilbertMap.load(path), path, tile.num_points)
     write_manifest(tiles.folder, replace(tiles.manifest, tiles=entries))
     return TiledMap.open(tiles.folder)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from lardhm_torch.clustering import Clusters
 from lardhm_torch.files import replaced_file
-from lardhm_torch.tiles.manifest import Index, tile_name
+from lardhm_torch.tiles.places import Index, tile_name
 from lardhm_torch.tiles.training import TileClusters
 
 _HEAD_BYTES = 16
@@ -71,8 +71,10 @@ def load_clusters_near(
     parts = [np.empty((0, 2 + dim + dim * dim), _kind(like))]
     for path, shift in sources:
         table = _table(path, like)
-        means = table[:, 2 : 2 + dim]
-        table = table[((means >= box[0] - shift) & (means <= box[1] - shift)).all(axis=1)]
+        inside = np.ones(len(table), dtype=bool)
+        for column, low, high in zip(table.T[2:], box[0] - shift, box[1] - shift, strict=False):
+            inside &= (column >= low) & (column <= high)
+        table = table[inside]
         table[:, 2 : 2 + dim] += shift
         parts.append(table)
     return _as_clusters(np.concatenate(parts), like)
@@ -107,15 +109,14 @@ def clustered_points(path: Path, like: Tensor) -> int | None:
 
 def _read(path: Path, like: Tensor) -> tuple[int, NDArray[Any]] | None:
     try:
-        content = bytearray(path.read_bytes())
+        content = np.fromfile(path, np.uint8)
     except OSError:
         return None
     if len(content) < _HEAD_BYTES:
         return None
-    num_points, rows = np.frombuffer(content, "<i8", 2).tolist()
+    num_points, rows = content[:_HEAD_BYTES].view("<i8").tolist()
     dim = like.shape[-1]
     columns = 2 + dim + dim * dim
     if len(content) != _HEAD_BYTES + rows * columns * like.element_size():
         return None
-    table = np.frombuffer(content, _kind(like), offset=_HEAD_BYTES)
-    return num_points, table.reshape(rows, columns)
+    return num_points, content[_HEAD_BYTES:].view(_kind(like)).reshape(rows, columns)

@@ -22,8 +22,6 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lardhm_torch.clustering import along_curve, factor_covariances
-from lardhm_torch.features import raw_factors
 from lardhm_torch.files import replaced_file
 from lardhm_torch.fitting import FitConfig
 from lardhm_torch.hilbert_map import LardHilbertMap
@@ -35,20 +33,17 @@ from lardhm_torch.tiles.cluster_files import (
     load_clusters_near,
     save_clusters,
 )
-from lardhm_torch.tiles.manifest import (
-    Index,
-    Manifest,
+from lardhm_torch.tiles.entries import (
     Tile,
     file_checksum,
-    read_manifest,
-    tile_name,
-    tile_path,
+    tile_from_json,
     tile_record,
-    touching_tiles,
-    write_manifest,
+    tile_to_json,
 )
+from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
+from lardhm_torch.tiles.places import Index, tile_name, tile_path, touching_tiles
 from lardhm_torch.tiles.ranks import Ranks, join_ranks, one_thread
-from lardhm_torch.tiles.samples import HALO, Counts, TilePoints, read_ledger, read_records, unpack
+from lardhm_torch.tiles.samples import Counts, TilePoints, read_ledger, read_records, unpack
 from lardhm_torch.tiles.training import (
     TileClusters,
     TrainingTask,
@@ -116,6 +111,7 @@ class _Job:
         if not self.ledger.complete:
             raise ValueError(f"{folder} must be complete; run `lardhm tile` to its end")
         self.config = FitConfig(**self.manifest.fitting)
+        self.first_corner = np.array(self.manifest.origin)
         self.budget = make_budget(self.ledger.tiles, self.config)
         self.empty = LardHilbertMap(**self.manifest.settings).to(
             self.device, getattr(torch, self.manifest.dtype)
@@ -162,7 +158,7 @@ class _Job:
     def cluster(self, index: Index) -> None:
         """Phase one: the clusters of a tile's core to their file."""
         found = cluster_tile(
-            self._points(index, core_alone=True),
+            self._points(index),
             self.budget.num_clusters(self.ledger.tiles[index]),
             self._rng(index, "clusters"),
         )
@@ -173,9 +169,8 @@ class _Job:
         own = load_clusters(clusters_path(self.folder, index), self.empty.centers)
         kernel, tile = self.empty.kernel, self._points(index)
         task = TrainingTask(kernel, self.config, self._rng(index, "weights"))
-        weights = train_tile(tile, own, self._around(index), self.budget, task)
+        weights, raw = train_tile(tile, own, self._around(index), self.budget, task)
         clusters = own.clusters
-        raw = raw_factors(factor_covariances(clusters.covariances, kernel.min_lengthscale))
         model = LardHilbertMap(**self.manifest.settings).to(weights)
         model.origin = torch.tensor(self._origin(index), device=self.device)
         moments = (clusters.counts, clusters.means, clusters.scatters)
@@ -184,17 +179,14 @@ class _Job:
         model.cpu().save(path)
         record = tile_record(model, path, self.ledger.tiles[index].core)
         with replaced_file(self._fitted_path(index, ".json"), durable=False) as partial:
-            partial.write_text(json.dumps({"chunks": self.ledger.chunks, **vars(record)}))
+            partial.write_text(json.dumps({"chunks": self.ledger.chunks, **tile_to_json(record)}))
 
-    def _points(self, index: Index, core_alone: bool = False) -> TilePoints:
-        """A tile's points in the frame of its map, along a space-filling curve."""
+    def _points(self, index: Index) -> TilePoints:
+        """A tile's points in the frame of its map."""
         counts = self.ledger.tiles[index]
         records = read_records(self.folder, index, counts, self.manifest.dim, MOST_POINTS)
-        if core_alone:
-            records = records[records["kind"] < HALO]
         shift = self._corner(index) - self._origin(index)
-        tile = unpack(records, self.device, self.empty.centers.dtype, shift)
-        return TilePoints(*along_curve(*tile))
+        return unpack(records, self.device, self.empty.centers.dtype, shift)
 
     def _around(self, index: Index) -> TileClusters:
         """The neighbors' clusters within two halos, in the frame of a tile."""
@@ -215,7 +207,7 @@ class _Job:
 
     def _corner(self, index: Index) -> NDArray[np.float64]:
         """(D,) lower corner of a tile, world frame [m]."""
-        return np.array(self.manifest.origin) + self.manifest.edge * np.array(index)
+        return self.first_corner + self.manifest.edge * np.array(index)
 
     def _origin(self, index: Index) -> NDArray[np.float64]:
         """(D,) origin of a tile's map: whole meters, as in `LardHilbertMap.fit`."""
@@ -239,8 +231,7 @@ class _Job:
         fields = json.loads(path.read_text())
         if fields.pop("chunks") != self.ledger.chunks:
             return None
-        lower, upper = fields["bounds"]
-        return Tile(**{**fields, "bounds": (tuple(lower), tuple(upper))})
+        return tile_from_json(fields)
 
     def take_over(self, wanted: list[Index]) -> None:
         """Fitted tiles into the map; if killed within, the next call ends it."""

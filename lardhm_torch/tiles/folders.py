@@ -9,16 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from lardhm_torch.tiles.cluster_files import clusters_path
-from lardhm_torch.tiles.manifest import (
-    Index,
-    Manifest,
-    Tile,
-    read_manifest,
-    samples_path,
-    tile_path,
-    touching_tiles,
-    write_manifest,
-)
+from lardhm_torch.tiles.entries import Tile
+from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
+from lardhm_torch.tiles.places import Index, samples_path, tile_path, touching_tiles
 from lardhm_torch.tiles.samples import Counts, Ledger, read_ledger, record_type, write_ledger
 
 PathLike = str | os.PathLike[str]

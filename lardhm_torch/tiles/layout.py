@@ -24,7 +24,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lardhm_torch.tiles.manifest import Index, Manifest
+from lardhm_torch.tiles.manifest import Manifest
+from lardhm_torch.tiles.places import Index
 
 BLOCK_CLUSTERS = 1 << 17  # of a block of tiles that are held as one map, about 20 MB
 _CELLS = 1 << 12  # of a box at most; larger boxes have larger cells

@@ -24,8 +24,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lardhm_torch.clustering import points_where
 from lardhm_torch.files import replaced_file
-from lardhm_torch.tiles.manifest import Index, samples_path, tile_index, tile_name
+from lardhm_torch.tiles.places import Index, samples_path, tile_index, tile_name
 
 FORMAT_VERSION = 1
 LEDGER_NAME, LOCK_NAME = "samples.json", "samples.lock"
@@ -184,20 +185,37 @@ def read_records(
 
 
 class TilePoints(NamedTuple):
-    """Training points of one tile, the frame of its corner: (N, D) [m], (N,) labels, (N,) in core."""
+    """Training points of one tile, the frame of its corner: (N, D) [m], and their (N,) uint8 bits."""
 
     points: Tensor
-    labels: Tensor
-    in_core: Tensor
+    kind: Tensor
+
+    @property
+    def labels(self) -> Tensor:
+        """(N,) 1 occupied, 0 free, of the points' dtype."""
+        return (self.kind & OCCUPIED).to(self.points)
+
+    @property
+    def in_core(self) -> Tensor:
+        """(N,) bool, False for copies in the halo."""
+        return self.kind < HALO
+
+    def core_points(self, label: int) -> Tensor:
+        """(C, D) points of the core with this label."""
+        return points_where(self.points, self.kind == label)
 
 
 def unpack(
     records: Records, device: torch.device, dtype: torch.dtype, shift: Any = 0.0
 ) -> TilePoints:
     """Records as tensors, the points moved by (D,) [m]."""
-    positions = records["position"].copy()  # aligned: sums of records as they are take far longer
-    positions += np.asarray(shift, dtype=np.float32)
+    size = records.dtype["position"].itemsize
+    blocks = np.dtype(
+        {"names": ["position"], "formats": [f"V{size}"], "itemsize": records.itemsize}
+    )
+    # Copied as blocks of bytes: twice as fast as number by number. Aligned sums are faster, too.
+    positions = records.view(blocks)["position"].copy().view("<f4").reshape(len(records), -1)
     points = torch.from_numpy(positions)
-    kind = torch.from_numpy(records["kind"].copy()).to(device)
-    labels = (kind & OCCUPIED).to(dtype)
-    return TilePoints(points.to(device, dtype), labels, (kind & HALO) == 0)
+    points += torch.as_tensor(shift, dtype=torch.float32)
+    kind = torch.from_numpy(records["kind"].copy())
+    return TilePoints(points.to(device, dtype), kind.to(device))

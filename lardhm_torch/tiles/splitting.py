@@ -11,14 +11,9 @@ from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.map_state import OF_THE_WHOLE
-from lardhm_torch.tiles.manifest import (
-    MANIFEST_NAME,
-    Manifest,
-    tile_indices,
-    tile_path,
-    tile_record,
-    write_manifest,
-)
+from lardhm_torch.tiles.entries import tile_record
+from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest
+from lardhm_torch.tiles.places import tile_indices, tile_path
 
 
 def split_map(model: LardHilbertMap, folder: str | os.PathLike[str], edge: float) -> None:

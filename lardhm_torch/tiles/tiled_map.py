@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,21 +13,14 @@ from torch import Tensor
 
 from lardhm_torch import uncertainty
 from lardhm_torch.hilbert_map import LardHilbertMap, check_axes, check_points
-from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number, shifted
-from lardhm_torch.tiles.layout import (
-    block_box,
-    layout_of,
-    needed_tiles,
-    speaking_blocks,
-)
-from lardhm_torch.tiles.manifest import Manifest, read_manifest, tile_indices
+from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number
+from lardhm_torch.tiles.manifest import Manifest, read_manifest
+from lardhm_torch.tiles.parts import Parts
 from lardhm_torch.tiles.splitting import split_map
-from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore, cluster_bytes, joined
+from lardhm_torch.tiles.store import TileStore
 
 MEMORY_LIMIT = 1 << 30  # bytes of clusters held at a time
 WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts")
-SAME_FRAME = 512.0  # [m] from the origin; there float32 rounds to 30 micrometers
-POINTS_AT_ONCE = 1 << 22  # points sorted by block at a time
 NUMBERS_AT_ONCE = 1 << 18  # points whose blocks are looked up at a time
 
 
@@ -63,14 +57,9 @@ class TiledMap:
         self.num_neighbors = int(manifest.settings["num_neighbors"])
         self.covariance_scale = float(manifest.settings["covariance_scale"])
         self.settings = dict(manifest.settings)
-        self.origin = torch.tensor(manifest.origin, dtype=torch.float64, device=device)
-        self._store = TileStore(folder, manifest, skip_damaged=skip_damaged, device=device)
-        self._layout = layout_of(manifest)
-        self._blocks = speaking_blocks(self._layout)
-        self._block_indices = self._blocks.indices()
-        self._cache = Cache(self.memory_limit)
-        self._block_rows: dict[int, Tensor] = {}  # tiles by block
-        self._missing: dict[Any, dict[int, DamagedTileError]] = {}  # damaged tiles by joined map
+        store = TileStore(folder, manifest, skip_damaged=skip_damaged, device=device)
+        self._parts = Parts(store, self.memory_limit)
+        self.origin = self._parts.origin
 
     @classmethod
     def open(
@@ -120,12 +109,12 @@ class TiledMap:
 
     def __len__(self) -> int:
         """Number of clusters of all tiles."""
-        return int(self._layout.counts.sum())
+        return int(self._parts.layout.counts.sum())
 
     def __repr__(self) -> str:
         """What `print(model)` shows."""
         settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())
-        tiles = len(self._layout.indices)
+        tiles = len(self.manifest.tiles)
         return (
             f"TiledMap({str(self.folder)!r}, {tiles} tiles, num_clusters={len(self)}, {settings})"
         )
@@ -134,7 +123,7 @@ class TiledMap:
         """Tensors of the whole map: those of `merge()`, if that fits the memory limit."""
         if name not in WHOLE:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return getattr(self._whole(), name)
+        return getattr(self._parts.whole(), name)
 
     # --- what the map answers ---
 
@@ -161,20 +150,28 @@ class TiledMap:
         """As `LardHilbertMap.query_lattice`, block by block."""
         check_axes(axes, self.dim)
         shape, silent = [len(axis) for axis in axes], 0.5 if probability else 0.0
-        result = torch.full(shape, silent, dtype=self._store.dtype, device=self._store.device)
-        for place in lattice_parts(axes, self._layout.origin, self._layout.block_edge):
+        result = torch.full(shape, silent, dtype=self._dtype, device=self.origin.device)
+        layout = self._parts.layout
+        for place in lattice_parts(axes, layout.origin, layout.block_edge):
             part = [axis[rows] for axis, rows in zip(axes, place, strict=True)]
-            corner = torch.stack([axis[0].double().cpu() for axis in part])
-            number = int(self._number(corner[None])[0])
+            ends = [torch.stack([axis[0], axis.min(), axis.max()]).double().cpu() for axis in part]
+            corner, *box = torch.stack(ends, dim=1)
+            number = int(self._parts.number(corner[None])[0])
             if number >= 0:
-                ends = torch.stack([torch.stack([a.min(), a.max()]) for a in part]).double().cpu()
-                model = self._block(number, ends[:, 0], ends[:, 1])
+                model = self._parts.block(number, torch.stack(box))
                 result[place] = model.query_lattice(part, probability=probability)
         return result
 
+    def thickness_counts(self) -> Counter[int]:
+        """As `surface.thickness_counts` of the merged map, from the manifest alone."""
+        total: Counter[int] = Counter()
+        for tile in self.manifest.tiles.values():
+            total.update(tile.thickness_counts())
+        return total
+
     def pieces(self) -> Iterator[LardHilbertMap]:
         """The tiles' own maps, one after the other."""
-        return (self._tile(row) for row in range(len(self._layout.indices)))
+        return self._parts.pieces()
 
     def merge(self, bounds: tuple[Any, Any] | None = None) -> LardHilbertMap:
         """An ordinary map that answers within ``bounds`` as this one does, in memory as a whole.
@@ -187,7 +184,7 @@ class TiledMap:
             ValueError: bounds are not two corners, lower <= upper.
         """
         if bounds is None:
-            return self._joined(list(self.pieces()), self.origin)
+            return self._parts.cut(None)
         lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
         good = lower.shape == upper.shape == (self.dim,)
         if not good or not bool((lower <= upper).all()):
@@ -195,8 +192,7 @@ class TiledMap:
                 f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
                 f"got {lower.tolist()} and {upper.tolist()}"
             )
-        rows = needed_tiles(self._layout, lower, upper).tolist()
-        return self._joined([self._tile(row) for row in rows])
+        return self._parts.cut((lower, upper))
 
     @torch.no_grad()
     def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
@@ -207,11 +203,12 @@ class TiledMap:
         """
         lower, upper = lower.detach().double().cpu(), upper.detach().double().cpu()
         middle = (lower + upper) / 2
-        index = ((middle - self._layout.origin) / self._layout.block_edge).floor()
+        layout = self._parts.layout
+        index = ((middle - layout.origin) / layout.block_edge).floor()
         _, owner, counts = index.unique(dim=0, return_inverse=True, return_counts=True)
         for rows in owner.argsort(stable=True).split(counts.tolist()):
             box = lower[rows].amin(dim=0), upper[rows].amax(dim=0)
-            yield rows.to(self.origin.device), self._part(*box)
+            yield rows.to(self.origin.device), self._parts.box(*box)
 
     # --- how ---
 
@@ -219,16 +216,15 @@ class TiledMap:
         self, points: Tensor, answer: Callable[[LardHilbertMap, Tensor], Tensor], silent: float
     ) -> Tensor:
         """Answers of the blocks' maps at (..., D) points; ``silent`` where no tile speaks."""
-        points = torch.as_tensor(points, device=self._store.device)
+        points = torch.as_tensor(points, device=self.origin.device)
         check_points(points, self.dim)
         flat = points.reshape(-1, self.dim)
-        result = torch.full((len(flat),), silent, dtype=self._store.dtype, device=flat.device)
+        result = torch.full((len(flat),), silent, dtype=self._dtype, device=flat.device)
         keeps_graph = torch.is_grad_enabled() and flat.requires_grad
         where, answers = [], []
         for number, rows in self._rows_by_block(flat.detach(), result):
-            part = flat[rows]
-            corners = part.detach().double()
-            model = self._block(number, corners.amin(0).cpu(), corners.amax(0).cpu())
+            part = flat[rows] if isinstance(rows, slice) else flat.index_select(0, rows)
+            model = self._parts.block(number, part)
             if len(model) == 0:
                 continue
             if keeps_graph:
@@ -249,104 +245,19 @@ class TiledMap:
 
         Points that are not finite get NaN in the result.
         """
-        for start in range(0, len(flat), POINTS_AT_ONCE):
-            part = flat[start : start + POINTS_AT_ONCE]
-            numbers = torch.cat([self._number(some) for some in part.split(NUMBERS_AT_ONCE)])
-            bad = ~part.isfinite().all(dim=1)
-            result[start : start + len(part)][bad] = torch.nan
-            for number, rows in rows_by_number(numbers.masked_fill_(bad, -1)):
-                yield number, shifted(rows, start)
+        if len(flat) == 0:
+            return
+        numbers = torch.cat([self._parts.number(some) for some in flat.split(NUMBERS_AT_ONCE)])
+        nowhere = (numbers < 0).nonzero().squeeze(1)  # all that are not finite are among them
+        for rows in nowhere.split(NUMBERS_AT_ONCE):
+            result[rows[~flat[rows].isfinite().all(dim=1)]] = torch.nan
+        groups = rows_by_number(numbers)
+        del numbers, nowhere
+        yield from groups
 
-    def _number(self, points: Tensor) -> Tensor:
-        """(N, D) world positions -> (N,) int32 number of the block of each, -1 where none speaks."""
-        index = tile_indices(points, self._layout.origin, self._layout.block_edge)
-        return self._blocks.find(index)
-
-    def _block(self, number: int, lower: Tensor, upper: Tensor) -> LardHilbertMap:
-        """The map that answers in a block; damage matters only to the box asked for, (D,) to (D,)."""
-        if number not in self._block_rows:
-            box = block_box(self._layout, self._block_indices[number])
-            self._block_rows[number] = needed_tiles(self._layout, *box)
-        return self._map_of(self._block_rows[number], lower, upper)
-
-    def _part(self, lower: Tensor, upper: Tensor) -> LardHilbertMap:
-        """The map that answers in a box (D,) to (D,): that of a block, if the box lies in one."""
-        corners = torch.stack([lower, upper])
-        first, last = tile_indices(corners, self._layout.origin, self._layout.block_edge)
-        number = int(self._blocks.find(first[None])[0])
-        if torch.equal(first, last) and number >= 0:
-            return self._block(number, lower, upper)
-        return self._map_of(needed_tiles(self._layout, lower, upper), lower, upper)
-
-    def _map_of(self, rows: Tensor, lower: Tensor, upper: Tensor) -> LardHilbertMap:
-        """One map of tiles (S,), kept; an error if one that the box (D,) to (D,) needs is damaged."""
-        key = ("joined", *rows.tolist())
-        model = self._cache.get(key)
-        if model is None:
-            self._make_room(rows, "the tiles that answer here")
-            tiles, missing = [], {}
-            for row in rows.tolist():
-                try:
-                    tiles.append(self._tile(row))
-                except DamagedTileError as error:
-                    missing[row] = error
-            model = self._joined(tiles)
-            self._cache.put(key, model)
-            self._missing[key] = missing
-        if self._missing[key]:
-            for row in needed_tiles(self._layout, lower, upper).tolist():
-                if row in self._missing[key]:
-                    raise self._missing[key][row]
-        return model
-
-    def _tile(self, row: int) -> LardHilbertMap:
-        index = self._layout.indices[row]
-        model = self._cache.get(index)
-        if model is None:
-            model = self._store.load(index)
-            self._cache.put(index, model)
-        return model
-
-    def _joined(self, tiles: list[LardHilbertMap], origin: Tensor | None = None) -> LardHilbertMap:
-        """One map of tiles.
-
-        Near the map's origin it has that frame, like the whole in one piece: in another, float32
-        would round points and centers otherwise, and who is the k-th nearest is sometimes a matter
-        of the last digit. Farther away that frame would lose what float32 can tell apart in one
-        amid the tiles.
-        """
-        if origin is None:
-            origin = self.origin
-            if tiles:
-                origins = torch.stack([tile.origin for tile in tiles])
-                lower, upper = origins.amin(dim=0), origins.amax(dim=0)
-                far = torch.maximum(upper - self.origin, self.origin - lower).max()
-                if far > SAME_FRAME:
-                    origin = ((lower + upper) / 2).round()
-        model = joined(tiles, self.settings, origin)
-        return model.to(self._store.device, self._store.dtype)
-
-    def _make_room(self, rows: Tensor, what: str) -> None:
-        """Forget what is unused longest, so that these tiles and what they make fit the limit."""
-        clusters = int(self._layout.counts[rows].sum())
-        needed = 2 * clusters * cluster_bytes(self.dim, self._store.dtype)
-        if needed > self.memory_limit:
-            raise ValueError(
-                f"memory_limit must be {needed} bytes or more to hold {what}; "
-                f"got {self.memory_limit}"
-            )
-        there = [self._cache.get(self._layout.indices[row]) for row in rows.tolist()]
-        clusters = 2 * clusters - sum(len(tile) for tile in there if tile is not None)
-        self._cache.make_room(clusters * cluster_bytes(self.dim, self._store.dtype))
-
-    def _whole(self) -> LardHilbertMap:
-        model = self._cache.get("whole")
-        if model is None:
-            rows = torch.arange(len(self._layout.indices))
-            self._make_room(rows, "all clusters, which are asked for")
-            model = self.merge()
-            self._cache.put("whole", model)
-        return model
+    @property
+    def _dtype(self) -> torch.dtype:
+        return self._parts.store.dtype
 
 
 def open_map(path: str | os.PathLike[str]) -> LardHilbertMap | TiledMap:

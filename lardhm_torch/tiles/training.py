@@ -23,13 +23,15 @@ from lardhm_torch.clustering import (
     MIN_COUNT,
     POINTS_PER_CLUSTER,
     Clusters,
+    along_curve,
     cluster_each,
     concatenate_clusters,
     factor_covariances,
 )
 from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, class_factors, deal_samples, fit_weights
-from lardhm_torch.tiles.samples import Counts, TilePoints
+from lardhm_torch.native.update import ordered_features
+from lardhm_torch.tiles.samples import OCCUPIED, Counts, TilePoints
 
 # Clusters of best accuracy lie denser where points do, but less so: where there are twice the
 # points, 2^0.8 times the occupied and 2^0.6 times the free clusters.
@@ -90,11 +92,12 @@ def cluster_tile(
     """Both classes of a tile's core, clustered apart; the occupied clusters first.
 
     Args:
-        tile: points in the order of `z_order`.
+        tile: points of the core, in any order; those of the halo are left out.
         num_clusters: of the occupied and of the free points.
         rng: random state.
     """
-    classes = [tile.points[tile.in_core & (tile.labels == label)] for label in (1, 0)]
+    classes = [tile.core_points(label) for label in (OCCUPIED, 0)]
+    classes = [along_curve(points)[0] if len(points) else points for points in classes]
     return TileClusters(*cluster_each(classes, num_clusters, rng))
 
 
@@ -104,11 +107,11 @@ def train_tile(
     around: TileClusters,
     budget: Budget,
     task: TrainingTask,
-) -> Tensor:
-    """(M,) weights of a tile's own clusters.
+) -> tuple[Tensor, Tensor]:
+    """(M,) weights and (M, D, D) raw factors of a tile's own clusters.
 
     Args:
-        tile: points of the core and of the halo, in the order of `z_order`.
+        tile: points of the core and of the halo, in any order.
         own: M clusters of the core.
         around: the neighbors' clusters that reach into the halo, same frame.
         budget: what a point counts.
@@ -119,15 +122,23 @@ def train_tile(
     rows = max(LEAST_BATCH, len(tile.points) // 128)
     config = replace(task.config, batch_size=task.config.batch_size or rows)
     size = config.rows_a_batch(len(tile.points))
-    points, labels = deal_samples((tile.points, tile.labels), size, task.rng)
+    points, kind = along_curve(*tile)
+    order = torch.arange(len(kind), device=kind.device)
+    order, kind = deal_samples((order, kind), size, task.rng)
     index = native.build_index(clusters.means, task.kernel.num_neighbors)
 
     def features_of(part: slice) -> tuple[Tensor, Tensor]:
-        return native.nearest_features(points[part], clusters.means, raw, task.kernel, index)
+        rows, given = order[part], (clusters.means, raw, task.kernel, index)
+        if len(rows) == len(points):
+            return ordered_features(points, rows, *given)
+        return native.nearest_features(points.index_select(0, rows), *given)
 
+    labels = (kind & OCCUPIED).to(points)
     start = clusters.means.new_zeros(len(clusters))
-    factors = labels.new_tensor(budget.loss_factors)[labels.long()]
-    return fit_weights(features_of, labels, start, config, factors=factors)[: len(own.clusters)]
+    free, occupied = labels.new_tensor(budget.loss_factors)
+    factors = torch.where(labels > 0, occupied, free)
+    weights = fit_weights(features_of, labels, start, config, factors=factors)
+    return weights[: len(own.clusters)], raw[: len(own.clusters)]
 
 
 class TrainingTask(NamedTuple):
