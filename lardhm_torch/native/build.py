@@ -29,13 +29,13 @@ FLAGS = (
     "-fno-trapping-math", "-fno-tree-slp-vectorize",  # packs neighbors through memory, and stalls
     "-fPIC", "-w", "-DTORCH_TARGET_VERSION=0x020a000000000000",
 )  # fmt: skip
-# Sources that are compiled together, the longest job first: torch's headers take a second a unit.
+# Sources that are compiled together, the longest job first. Torch's headers take a second a unit: the
+# last two do without.
 UNITS = (
-    ("raycast",),
-    ("update", "pooling", "index", "parameters", "kth_distance"),
-    ("kmeans", "descent", "gradients"),
-    ("search",),
-    ("query",),
+    ("query", "kmeans", "gradients", "descent"),
+    ("raycast", "update", "pooling", "threads"),
+    ("search", "index"),
+    ("kth_distance", "parameters", "sorting"),
 )
 COMPILERS = ("c++", "g++", "clang++")
 OFF = ("0", "false", "off", "no")

@@ -122,12 +122,12 @@ void check_descent(const Tensor& indices, const Tensor& values, const Tensor& la
               indices.scalar_type() == ScalarType::Int;
   for (const Tensor* t : {&std::get<0>(state), &std::get<1>(state), &std::get<2>(state)})
     fits = fits && t->numel() == count && t->scalar_type() == dtype;
-  STD_TORCH_CHECK(fits, "features, labels, factors and state must agree in size and dtype");
+  check(fits, "features, labels, factors and state must agree in size and dtype");
   const int32_t* index = in<int32_t>(indices);
   const int64_t entries = indices.numel();
   uint32_t largest = 0;
   for (int64_t i = 0; i < entries; ++i) largest = std::max(largest, uint32_t(index[i]));
-  STD_TORCH_CHECK(entries == 0 || int64_t(largest) < count, "index out of range");
+  check(entries == 0 || int64_t(largest) < count, "index out of range");
 }
 
 Tensor copy_of(const Tensor& tensor) {
@@ -144,7 +144,7 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
               double l1, double l2) {
   const Tensor indices = tidy(given_indices), values = tidy(given_values);
   const Tensor labels = tidy(given_labels), factors = tidy(given_factors);
-  STD_TORCH_CHECK(batch_size >= 1, "batch_size must be 1 or more");
+  check(batch_size >= 1, "batch_size must be 1 or more");
   check_descent(indices, values, labels, factors, {weights, mean, square});
   const State state{copy_of(weights), copy_of(mean), copy_of(square)};
   const Rates rates{num_points, batch_size, first_step, total_steps, learning_rate,
@@ -156,8 +156,8 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
     run_batches<T>(rows, n, count, state, rates);
   };
   const bool wide = values.scalar_type() == ScalarType::Double;
-  STD_TORCH_CHECK(wide || values.scalar_type() == ScalarType::Float,
-                  "values must be float32 or float64");
+  check(wide || values.scalar_type() == ScalarType::Float,
+        "values must be float32 or float64");
   wide ? run(double{}) : run(float{});
   return state;
 }

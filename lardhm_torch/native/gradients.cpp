@@ -139,9 +139,9 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
   const Tensor grad = tidy(given_grad), points = tidy(given_points);
   check_rows("points", points, centers);
   const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
-  STD_TORCH_CHECK(grad.dim() == 1 && grad.size(0) == points.size(0) &&
-                      grad.scalar_type() == points.scalar_type(),
-                  "grad must be (N,), one per point, of the points' dtype");
+  check(grad.dim() == 1 && grad.size(0) == points.size(0) &&
+            grad.scalar_type() == points.scalar_type(),
+        "grad must be (N,), one per point, of the points' dtype");
   const int64_t count = centers.size(0), n = points.size(0);
   const Gradients result{
       like_or_empty(points, wanted & kPoints), like_or_empty(map.centers, wanted & kCenters),
@@ -154,11 +154,12 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
       const int64_t size = count * Layout<dim()>::gradient;
       const int64_t parts = parts_of(n, size * sizeof(T), parameters);
       std::vector<T> sums((wanted & ~kPoints) ? size * parts : 0);
-      visit_parts<T, dim()>(in<T>(points), n, parameters, k, parts, [&](int64_t part) {
-        return std::make_unique<BackwardVisitor<T, dim()>>(
-            parameters, in<T>(grad), probability, wanted,
-            (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr, sums.data() + part * size);
-      });
+      std::vector<BackwardVisitor<T, dim()>> visitors;
+      for (int64_t part = 0; part < parts; ++part)
+        visitors.emplace_back(parameters, in<T>(grad), probability, wanted,
+                              (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr,
+                              sums.data() + part * size);
+      visit_parts<T, dim()>(in<T>(points), n, parameters, k, each_of<T, dim()>(visitors));
       if (wanted & ~kPoints)
         scatter_gradients<T, dim()>(parameters, sums.data(), parts,
                                     (wanted & kWeights) ? out<T>(std::get<3>(result)) : nullptr,

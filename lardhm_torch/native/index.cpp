@@ -111,14 +111,25 @@ struct IndexBuilder {
 }  // namespace
 
 template <class T, int D>
-void build_index(const T* centers, int64_t count, const std::function<char*(int64_t)>& place) {
-  const IndexBuilder<T, D> builder(centers, count);
-  builder.write(place(builder.header.bytes));
+void write_index(const T* centers, int64_t count, char* to) {
+  IndexBuilder<T, D>(centers, count).write(to);
 }
 
-#define LARDHM_INSTANTIATE(T, D)                                                \
-  template bool matches<T, D>(const char*, int64_t, const T*, int64_t);         \
-  template void build_index<T, D>(const T*, int64_t, const std::function<char*(int64_t)>&);
+template <class T, int D>
+CallIndex<T, D>::CallIndex(const char* given, int64_t size, const T* centers, int64_t count) {
+  if (matches<T, D>(given, size, centers, count)) {
+    index = view_of(given);
+    return;
+  }
+  own.allocate(index_size<T, D>(count));
+  write_index<T, D>(centers, count, own.data);
+  index = view_of(own.data);
+}
+
+#define LARDHM_INSTANTIATE(T, D)                                        \
+  template bool matches<T, D>(const char*, int64_t, const T*, int64_t); \
+  template void write_index<T, D>(const T*, int64_t, char*);            \
+  template struct CallIndex<T, D>;
 LARDHM_INSTANTIATE(float, 2)
 LARDHM_INSTANTIATE(float, 3)
 LARDHM_INSTANTIATE(double, 2)

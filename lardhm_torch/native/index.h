@@ -7,7 +7,6 @@
 
 #include <cstdint>
 #include <cstring>
-#include <functional>
 #include <limits>
 #include <memory>
 
@@ -96,8 +95,25 @@ struct AlignedArray {
   }
 };
 
-// Makes the index of (count, D) centers; `place(size)` gives the memory to write it to.
+// How many bytes the index of (count, D) centers has.
 template <class T, int D>
-void build_index(const T* centers, int64_t count, const std::function<char*(int64_t)>& place);
+int64_t index_size(int64_t count) {
+  Header header{};
+  header.count = count, header.dim = D, header.item_size = sizeof(T);
+  return Sections(header).end;
+}
+
+// Writes the index of (count, D) centers.
+template <class T, int D>
+void write_index(const T* centers, int64_t count, char* to);
+
+// An index for one call: the one given where it fits, else one of its own.
+template <class T, int D>
+struct CallIndex {
+  AlignedArray<char> own;
+  Index index;
+
+  CallIndex(const char* given, int64_t size, const T* centers, int64_t count);
+};
 
 }  // namespace lardhm

@@ -53,9 +53,10 @@ MomentParts<D> moments_of(const T* points, int64_t n, const T* centers, const In
   Parameters<T, D> parameters(index, centers, nullptr, nullptr, {}, n >= count / kPointsOfFew);
   const int64_t bytes = count * kMoments<D> * sizeof(double);
   MomentParts<D> moments(count, parts_of(n, bytes, parameters));
-  visit_parts<T, D>(points, n, parameters, 1, moments.parts, [&](int64_t part) {
-    return std::make_unique<AssignVisitor<T, D>>(parameters, scatter, labels, moments.part(part));
-  });
+  std::vector<AssignVisitor<T, D>> visitors;
+  for (int64_t part = 0; part < moments.parts; ++part)
+    visitors.emplace_back(parameters, scatter, labels, moments.part(part));
+  visit_parts<T, D>(points, n, parameters, 1, each_of<T, D>(visitors));
   return moments;
 }
 
@@ -67,7 +68,7 @@ Moments assign(const Tensor& given_points, const Tensor& given_centers, const Te
   const Tensor index = usable_index(given_index);
   check_rows("points", points, centers);
   const int64_t count = centers.size(0), dim_size = centers.size(1), n = points.size(0);
-  STD_TORCH_CHECK(count > 0, "centers must hold at least one row");
+  check(count > 0, "centers must hold at least one row");
   const Moments result{torch::stable::new_empty(points, {n}, ScalarType::Long),
                        torch::stable::new_zeros(points, {count}),
                        torch::stable::new_zeros(points, {count, dim_size}),
@@ -75,7 +76,7 @@ Moments assign(const Tensor& given_points, const Tensor& given_centers, const Te
   if (n == 0) return result;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
-    const CallIndex<T, dim()> call(index, in<T>(centers), count);
+    const CallIndex<T, dim()> call(in<char>(index), index.numel(), in<T>(centers), count);
     const auto moments = moments_of<T, dim()>(in<T>(points), n, in<T>(centers), call.index, scatter,
                                               out<int64_t>(std::get<0>(result)));
     moments.write(call.index.order, out<T>(std::get<1>(result)), out<T>(std::get<2>(result)),
@@ -86,23 +87,19 @@ Moments assign(const Tensor& given_points, const Tensor& given_centers, const Te
 }
 
 void check_row_numbers(const Tensor& rows, int64_t count) {
-  STD_TORCH_CHECK(rows.scalar_type() == ScalarType::Long, "rows must be int64");
+  check(rows.scalar_type() == ScalarType::Long, "rows must be int64");
   const int64_t* row = in<int64_t>(rows);
   const int64_t entries = rows.numel();
   uint64_t largest = 0;
   for (int64_t i = 0; i < entries; ++i) largest = std::max(largest, uint64_t(row[i]));
-  STD_TORCH_CHECK(entries == 0 || largest < uint64_t(count), "row out of range");
+  check(entries == 0 || largest < uint64_t(count), "row out of range");
 }
 
 // One batch: every point pulls its nearest center; `met` is how many pulled it since the restart.
 template <class T, int D>
 void pull_centers(const std::vector<T>& batch, T* centers, int64_t count, std::vector<T>& met) {
-  AlignedArray<char> bytes;
-  build_index<T, D>(centers, count, [&](int64_t size) {
-    bytes.allocate(size);
-    return bytes.data;
-  });
-  const Index index = view_of(bytes.data);
+  const CallIndex<T, D> call(nullptr, 0, centers, count);
+  const Index& index = call.index;
   const auto moments =
       moments_of<T, D>(batch.data(), batch.size() / D, centers, index, false, nullptr);
   for (int64_t rank = 0; rank < count; ++rank) {
@@ -119,8 +116,8 @@ Tensor kmeans(const Tensor& given_points, const Tensor& given_start, const Tenso
   const Tensor points = tidy(given_points), start = tidy(given_start), rows = tidy(given_rows);
   check_rows("points", points, start);
   check_row_numbers(rows, points.size(0));
-  STD_TORCH_CHECK(batch_size >= 1 && restart_every >= 1 && start.size(0) >= 1,
-                  "batch_size, restart_every and the number of centers must be 1 or more");
+  check(batch_size >= 1 && restart_every >= 1 && start.size(0) >= 1,
+        "batch_size, restart_every and the number of centers must be 1 or more");
   const Tensor centers = torch::stable::new_empty(start, start.sizes());
   dispatch(start, [&](auto type, auto dim) {
     using T = decltype(type);

@@ -91,12 +91,12 @@ using Clusters = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 void check_moments(const Tensor& counts, const Tensor& means, const Tensor& scatters,
                    const Tensor& like) {
   const int64_t size = like.size(0), dim = like.size(1);
-  STD_TORCH_CHECK(counts.scalar_type() == ScalarType::Long && counts.numel() == size &&
-                      means.dim() == 2 && means.size(0) == size && means.size(1) == dim &&
-                      scatters.numel() == size * dim * dim &&
-                      means.scalar_type() == like.scalar_type() &&
-                      scatters.scalar_type() == like.scalar_type(),
-                  "counts (M,) int64, means (M, D) and scatters (M, D, D) must be of one size");
+  check(counts.scalar_type() == ScalarType::Long && counts.numel() == size &&
+            means.dim() == 2 && means.size(0) == size && means.size(1) == dim &&
+            scatters.numel() == size * dim * dim &&
+            means.scalar_type() == like.scalar_type() &&
+            scatters.scalar_type() == like.scalar_type(),
+        "counts (M,) int64, means (M, D) and scatters (M, D, D) must be of one size");
 }
 
 // (counts, means, scatters, how far the means moved, raw factors) of the clusters of both.
@@ -139,7 +139,7 @@ Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tenso
           definite = false;
       }
     });
-    STD_TORCH_CHECK(definite, "a pooled covariance is not positive definite");
+    check(definite, "a pooled covariance is not positive definite");
     return 0;
   });
   return result;

@@ -83,10 +83,9 @@ Tensor make_index(const Tensor& given_centers, int64_t k) {
   Tensor index;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
-    build_index<T, dim()>(in<T>(centers), centers.size(0), [&](int64_t size) {
-      index = torch::stable::new_empty(centers, {size}, ScalarType::Byte);
-      return out<char>(index);
-    });
+    const int64_t count = centers.size(0);
+    index = torch::stable::new_empty(centers, {index_size<T, dim()>(count)}, ScalarType::Byte);
+    write_index<T, dim()>(in<T>(centers), count, out<char>(index));
     return 0;
   });
   return index;
@@ -114,13 +113,12 @@ Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t 
   if (k == 0) return rows;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
-    const CallIndex<T, dim()> call(index, in<T>(centers), centers.size(0));
+    const CallIndex<T, dim()> call(in<char>(index), index.numel(), in<T>(centers),
+                                   centers.size(0));
     Parameters<T, dim()> parameters(call.index, in<T>(centers), nullptr, nullptr, {},
                                     n >= centers.size(0) / kPointsOfFew);
-    visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
-      return std::make_unique<NeighborVisitor<T, dim(), int64_t>>(
-          parameters, k, out<int64_t>(rows), nullptr, nullptr);
-    });
+    NeighborVisitor<T, dim(), int64_t> visitor(parameters, k, out<int64_t>(rows), nullptr, nullptr);
+    visit_all<T, dim()>(in<T>(points), n, parameters, k, visitor);
     return 0;
   });
   return rows;
@@ -128,14 +126,14 @@ Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t 
 
 // Where each row comes to stand in an order of n rows.
 std::vector<int32_t> places_of(const Tensor& order, int64_t n) {
-  STD_TORCH_CHECK(order.scalar_type() == ScalarType::Long && order.numel() == n &&
-                      n < (int64_t(1) << 31),
-                  "order must be int64 and hold every row of the points once");
+  check(order.scalar_type() == ScalarType::Long && order.numel() == n &&
+            n < (int64_t(1) << 31),
+        "order must be int64 and hold every row of the points once");
   std::vector<int32_t> place(n, -1);
   const int64_t* row = in<int64_t>(order);
   for (int64_t i = 0; i < n; ++i) {
-    STD_TORCH_CHECK(row[i] >= 0 && row[i] < n && place[row[i]] < 0,
-                    "order must hold every row of the points once");
+    check(row[i] >= 0 && row[i] < n && place[row[i]] < 0,
+          "order must hold every row of the points once");
     place[row[i]] = int32_t(i);
   }
   return place;
@@ -163,10 +161,9 @@ std::tuple<Tensor, Tensor> features_in_order(const Tensor& given_points, const T
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     with_parameters<T, dim()>(map, n, [&](Parameters<T, dim()>& parameters) {
-      visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
-        return std::make_unique<NeighborVisitor<T, dim(), int32_t>>(
-            parameters, k, out<int32_t>(rows), out<T>(values), ordered ? places.data() : nullptr);
-      });
+      NeighborVisitor<T, dim(), int32_t> visitor(parameters, k, out<int32_t>(rows), out<T>(values),
+                                                 ordered ? places.data() : nullptr);
+      visit_all<T, dim()>(in<T>(points), n, parameters, k, visitor);
     });
     return 0;
   });
@@ -217,10 +214,8 @@ Tensor occupancy(const Tensor& given_points, const Tensor& centers, const Tensor
     }
     const int64_t n = points.size(0);
     with_parameters<T, dim()>(map, n, [&](Parameters<T, dim()>& parameters) {
-      visit_all<T, dim()>(in<T>(points), n, parameters, k, [&](int64_t) {
-        return std::make_unique<OccupancyVisitor<T, dim()>>(parameters, probability,
-                                                            out<T>(values));
-      });
+      OccupancyVisitor<T, dim()> visitor(parameters, probability, out<T>(values));
+      visit_all<T, dim()>(in<T>(points), n, parameters, k, visitor);
     });
     return 0;
   });
@@ -238,10 +233,10 @@ Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderO
   int64_t coordinates = 0, total = 1, near = 1;
   for (int64_t n : shape) coordinates += n, total *= n;
   for (size_t d = 1; d < shape.size(); ++d) near *= shape[d];
-  STD_TORCH_CHECK(int64_t(shape.size()) == centers.size(1) && axes.numel() == coordinates &&
-                      axes.scalar_type() == centers.scalar_type() && near < (int64_t(1) << 26),
-                  "axes must hold one list of coordinates for each dimension of the map, of its "
-                  "dtype, and fewer than 2^26 points in a plane");
+  check(int64_t(shape.size()) == centers.size(1) && axes.numel() == coordinates &&
+            axes.scalar_type() == centers.scalar_type() && near < (int64_t(1) << 26),
+        "axes must hold one list of coordinates for each dimension of the map, of its "
+        "dtype, and fewer than 2^26 points in a plane");
   k = std::min(k, centers.size(0));
   const Tensor values = torch::stable::new_zeros(axes, shape);
   if (total == 0 || k == 0) return probability ? torch::stable::fill_(values, 0.5) : values;
@@ -251,9 +246,8 @@ Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderO
     const T* axis[D];
     for (int d = 0; d < D; ++d) axis[d] = d ? axis[d - 1] + shape[d - 1] : in<T>(axes);
     with_parameters<T, D>(map, total, [&](Parameters<T, D>& parameters) {
-      visit_lattice<T, D>(axis, shape.data(), parameters, k, [&](int64_t) {
-        return std::make_unique<OccupancyVisitor<T, D>>(parameters, probability, out<T>(values));
-      });
+      OccupancyVisitor<T, D> visitor(parameters, probability, out<T>(values));
+      visit_lattice<T, D>(axis, shape.data(), parameters, k, visitor);
     });
     return 0;
   });

@@ -11,9 +11,9 @@
 #include <limits>
 #include <vector>
 
-#include "engine.h"
 #include "intervals.h"
 #include "occupancy.h"
+#include "sorting.h"
 #include "tensors.h"
 
 namespace lardhm {
@@ -223,16 +223,15 @@ void clip(Ray<T, D>& ray, const Box<double, D>& box, const March& march) {
 // One wave of rays, from start to end.
 template <class T, int D>
 struct Wave {
-  Parameters<T, D>& parameters;
-  int64_t k;
+  const Parameters<T, D>& parameters;
   const March& march;
-  Scratch<T, D> scratch;
+  Search<T, D> search;
   std::vector<Ray<T, D>> rays;
   Intervals<T, D> intervals;
   std::vector<T> points, values;
 
-  Wave(Parameters<T, D>& parameters_, int64_t k_, const March& march_)
-      : parameters(parameters_), k(k_), march(march_) {}
+  Wave(Parameters<T, D>& parameters_, int64_t k, const March& march_)
+      : parameters(parameters_), march(march_), search(parameters_, k) {}
 
   void run(double* results) {
     for (;;) {
@@ -271,18 +270,15 @@ struct Wave {
 
   void bound() {
     intervals.make_room();
-    Engine<T, D> engine(intervals.middles.data(), parameters, k);
-    engine.slack = intervals.slack.data();
     IntervalVisitor<T, D> visitor(parameters, intervals);
-    if (intervals.size()) engine.visit(0, intervals.size(), scratch, visitor);
+    search.visit(intervals.middles.data(), intervals.slack.data(), intervals.size(), visitor);
   }
 
   void evaluate() {
     const int64_t n = int64_t(points.size()) / D;
     values.resize(n);
-    const Engine<T, D> engine(points.data(), parameters, k);
     OccupancyVisitor<T, D> visitor(parameters, false, values.data());
-    if (n) engine.visit(0, n, scratch, visitor);
+    search.visit(points.data(), nullptr, n, visitor);
   }
 };
 
@@ -338,11 +334,11 @@ Tensor raycast(const Tensor& given_origins, const Tensor& given_ways, double ste
   const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
   const int64_t n = origins.size(0);
   for (const Tensor* rays : {&origins, &ways})
-    STD_TORCH_CHECK(rays->dim() == 2 && rays->size(0) == n && rays->size(1) == centers.size(1) &&
-                        rays->scalar_type() == ScalarType::Double,
-                    "origins and directions must be (R, D) float64");
-  STD_TORCH_CHECK(step > 0 && max_range > 0 && max_range < 1e15 * step,
-                  "step and max_range must be > 0");
+    check(rays->dim() == 2 && rays->size(0) == n && rays->size(1) == centers.size(1) &&
+              rays->scalar_type() == ScalarType::Double,
+          "origins and directions must be (R, D) float64");
+  check(step > 0 && max_range > 0 && max_range < 1e15 * step,
+        "step and max_range must be > 0");
   k = std::min(k, centers.size(0));
   const Tensor results = torch::stable::new_empty(origins, {n});
   if (k == 0) return torch::stable::fill_(results, kInfinity);

@@ -44,32 +44,31 @@ int64_t block_size(const Engine<T, D>& engine, int64_t n, int64_t workers) {
 
 template <class T, int D>
 void visit_all(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
-               const MakeVisitor<T, D>& make) {
+               Visitor<T, D>& visitor) {
   if (n == 0) return;
   const Engine<T, D> engine(points, parameters, k);
   const int64_t threads = parameters.packed.empty() ? num_threads() : 1;
   const int64_t block = block_size(engine, n, threads);
   const int64_t blocks = (n + block - 1) / block;
   std::atomic<int64_t> next{0};
-  run_tasks(std::min(blocks, threads), [&](int64_t worker) {
+  run_tasks(std::min(blocks, threads), [&](int64_t) {
     Scratch<T, D> scratch;
-    const auto visitor = make(worker);
     for (int64_t i = next++; i < blocks; i = next++)
-      engine.visit(i * block, std::min(n, (i + 1) * block), scratch, *visitor);
+      engine.visit(i * block, std::min(n, (i + 1) * block), scratch, visitor);
   });
 }
 
 template <class T, int D>
-void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k, int64_t parts,
-                 const MakeVisitor<T, D>& make) {
+void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
+                 const std::vector<Visitor<T, D>*>& visitors) {
+  const int64_t parts = int64_t(visitors.size());
   const Engine<T, D> engine(points, parameters, k);
   const int64_t block = block_size(engine, n, parts);
   run_tasks(parts, [&](int64_t part) {
     Scratch<T, D> scratch;
-    const auto visitor = make(part);
     const int64_t begin = n * part / parts, end = n * (part + 1) / parts;
     for (int64_t i = begin; i < end; i += block)
-      engine.visit(i, std::min(end, i + block), scratch, *visitor);
+      engine.visit(i, std::min(end, i + block), scratch, *visitors[part]);
   });
 }
 
@@ -147,35 +146,48 @@ int64_t fill_brick(const T* const* axes, const Lattice<D>& lattice, const int64_
 
 template <class T, int D>
 void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>& parameters,
-                   int64_t k, const MakeVisitor<T, D>& make) {
+                   int64_t k, Visitor<T, D>& visitor) {
   const Lattice<D> lattice(shape);
   const Engine<T, D> engine(nullptr, parameters, k);
   const auto order = brick_order<D>();
   const int64_t threads = parameters.packed.empty() ? num_threads() : 1;
   std::atomic<int64_t> next{0};
-  run_tasks(std::min(lattice.tasks, threads), [&](int64_t worker) {
+  run_tasks(std::min(lattice.tasks, threads), [&](int64_t) {
     constexpr int64_t kRun = 16;  // bricks taken at a time
     Scratch<T, D> scratch;
     scratch.make_room();
-    const auto visitor = make(worker);
     for (int64_t begin = kRun * next++; begin < lattice.tasks; begin = kRun * next++)
       for (int64_t brick = begin; brick < std::min(lattice.tasks, begin + kRun); ++brick) {
         int64_t first[D];
         int edge[D];
         lattice.corner(brick, first, edge);
         const int64_t n = fill_brick<T, D>(axes, lattice, first, edge, order, scratch);
-        engine.visit_filled(lattice.row(first), n, lattice.total, scratch, *visitor);
+        engine.visit_filled(lattice.row(first), n, lattice.total, scratch, visitor);
       }
   });
 }
 
-#define LARDHM_INSTANTIATE(T, D)                                                                 \
-  template void visit_all<T, D>(const T*, int64_t, Parameters<T, D>&, int64_t,                   \
-                                const MakeVisitor<T, D>&);                                       \
-  template void visit_parts<T, D>(const T*, int64_t, Parameters<T, D>&, int64_t, int64_t,        \
-                                  const MakeVisitor<T, D>&);                                     \
-  template void visit_lattice<T, D>(const T* const*, const int64_t*, Parameters<T, D>&, int64_t, \
-                                    const MakeVisitor<T, D>&);
+template <class T, int D>
+Search<T, D>::Search(Parameters<T, D>& parameters_, int64_t k_)
+    : parameters(parameters_), k(k_), scratch(new Scratch<T, D>) {}
+
+template <class T, int D>
+Search<T, D>::~Search() = default;
+
+template <class T, int D>
+void Search<T, D>::visit(const T* points, const T* slack, int64_t n, Visitor<T, D>& visitor) {
+  Engine<T, D> engine(points, parameters, k);
+  engine.slack = slack;
+  if (n) engine.visit(0, n, *scratch, visitor);
+}
+
+#define LARDHM_INSTANTIATE(T, D)                                                                   \
+  template void visit_all<T, D>(const T*, int64_t, Parameters<T, D>&, int64_t, Visitor<T, D>&);    \
+  template void visit_parts<T, D>(const T*, int64_t, Parameters<T, D>&, int64_t,                   \
+                                  const std::vector<Visitor<T, D>*>&);                             \
+  template void visit_lattice<T, D>(const T* const*, const int64_t*, Parameters<T, D>&, int64_t,   \
+                                    Visitor<T, D>&);                                               \
+  template class Search<T, D>;
 LARDHM_INSTANTIATE(float, 2)
 LARDHM_INSTANTIATE(float, 3)
 LARDHM_INSTANTIATE(double, 2)

@@ -4,8 +4,8 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <functional>
 #include <memory>
+#include <vector>
 
 #include "packets.h"
 
@@ -19,25 +19,49 @@ struct Visitor {
   virtual void packet(const Packet<T, D>& packet, const Selection& selected) = 0;
 };
 
-template <class T, int D>
-using MakeVisitor = std::function<std::unique_ptr<Visitor<T, D>>(int64_t)>;
-
-// Shows every point with its k nearest centers once, to one visitor a thread.
+// Shows every point with its k nearest centers once, to the one visitor of all threads.
 template <class T, int D>
 void visit_all(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
-               const MakeVisitor<T, D>& make);
+               Visitor<T, D>& visitor);
 
-// The same in parts of the points in a fixed order, each with a visitor of its own: what they sum
-// depends on the number of parts, not on the threads' timing.
+// The same in as many parts of the points as there are visitors, each with one of its own: what they
+// sum depends on the number of parts, not on the threads' timing.
 template <class T, int D>
-void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k, int64_t parts,
-                 const MakeVisitor<T, D>& make);
+void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
+                 const std::vector<Visitor<T, D>*>& visitors);
+
+template <class T, int D, class Own>
+std::vector<Visitor<T, D>*> each_of(std::vector<Own>& own) {
+  std::vector<Visitor<T, D>*> visitors;
+  for (Own& visitor : own) visitors.push_back(&visitor);
+  return visitors;
+}
 
 // Shows all points of a lattice, the D lists of coordinates in `axes` (shape[d] finite ones each, the
 // last axis fastest), brick by brick: there is nothing to sort, and no point is ever stored.
 template <class T, int D>
 void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>& parameters,
-                   int64_t k, const MakeVisitor<T, D>& make);
+                   int64_t k, Visitor<T, D>& visitor);
+
+template <class T, int D>
+struct Scratch;
+
+// The search on one thread, which keeps its memory from call to call.
+template <class T, int D>
+class Search {
+ public:
+  Search(Parameters<T, D>& parameters, int64_t k);
+  ~Search();
+
+  // Shows the visitor n points with their k nearest centers and, where slack [m] by point is given,
+  // all that are no more than that much farther than the k-th.
+  void visit(const T* points, const T* slack, int64_t n, Visitor<T, D>& visitor);
+
+ private:
+  Parameters<T, D>& parameters;
+  int64_t k;
+  std::unique_ptr<Scratch<T, D>> scratch;
+};
 
 // How many parts to sum in: one a thread, fewer where the sums outweigh the work.
 template <class T, int D>

@@ -2,8 +2,6 @@
 
 #pragma once
 
-#include <algorithm>
-#include <cmath>
 #include <cstdint>
 #include <limits>
 #include <vector>
@@ -21,39 +19,9 @@ struct Box {
     }
   }
 
-  // Takes in the finite coordinates of the rows begin .. end; false where some are not finite.
-  bool add(const T* points, int64_t begin, int64_t end, int64_t step) {
-    constexpr int kRun = 16 * D;
-    T lowest[kRun], highest[kRun], sum[kRun] = {};
-    for (int i = 0; i < kRun; ++i) lowest[i] = low[i % D], highest[i] = high[i % D];
-    for (int64_t row = begin; row < end; row += 16 * step) {
-      const T* run = points + row * D;
-      if (step > 1 || row + 16 > end) {
-        for (int64_t one = row; one < std::min(end, row + 16 * step); one += step)
-          add_run<D>(points + one * D, lowest, highest, sum);
-      } else {
-        add_run<kRun>(run, lowest, highest, sum);
-      }
-    }
-    T total = 0;
-    for (int i = 0; i < kRun; ++i) {
-      low[i % D] = std::min(low[i % D], lowest[i]);
-      high[i % D] = std::max(high[i % D], highest[i]);
-      total += sum[i];
-    }
-    return total == T(0);
-  }
-
-  template <int Run>
-  static void add_run(const T* run, T* lowest, T* highest, T* sum) {
-    const T largest = std::numeric_limits<T>::max();
-    for (int i = 0; i < Run; ++i) {
-      const T x = run[i];
-      sum[i] += x * T(0);
-      lowest[i] = x < lowest[i] && x >= -largest ? x : lowest[i];
-      highest[i] = x > highest[i] && x <= largest ? x : highest[i];
-    }
-  }
+  // Takes in the finite coordinates of every `step`-th of the rows begin .. end; false where some
+  // of them are not finite.
+  bool add(const T* points, int64_t begin, int64_t end, int64_t step);
 };
 
 template <class T>
@@ -68,23 +36,10 @@ struct Sorter {
   std::vector<uint64_t> items, other;
   std::vector<uint32_t> histogram;
 
-  void counting_pass(int shift, int bits) {
-    const uint32_t mask = (1u << bits) - 1;
-    histogram.assign(int64_t(mask) + 2, 0);
-    for (uint64_t item : items) ++histogram[((item >> shift) & mask) + 1];
-    for (uint32_t digit = 0; digit < mask; ++digit) histogram[digit + 1] += histogram[digit];
-    other.resize(items.size());
-    for (uint64_t item : items) other[histogram[(item >> shift) & mask]++] = item;
-    items.swap(other);
-  }
+  void sort(int key_bits);
 
-  void sort(int key_bits) {
-    const int passes = key_bits <= 12 ? 1 : (key_bits + 10) / 11;
-    for (int pass = 0; pass < passes; ++pass) {
-      const int shift = key_bits * pass / passes;
-      counting_pass(32 + shift, key_bits * (pass + 1) / passes - shift);
-    }
-  }
+ private:
+  void counting_pass(int shift, int bits);
 };
 
 // Z curve: how the bits of the cells along the axes interleave, coarse cells first.
@@ -96,60 +51,17 @@ struct ZCurve {
   std::vector<uint32_t> spread[D];
 
   // About `cells` cubes over a box with these edges, at most 2^10 along an axis.
-  ZCurve(const double* edges, double cells) {
-    double largest = 0, volume = 1, shortest = 0;
-    for (int d = 0; d < D; ++d) largest = std::max(largest, edges[d]);
-    shortest = largest / 1024;
-    for (int d = 0; d < D; ++d) volume *= std::max(edges[d], shortest);
-    const double edge = std::max(std::pow(volume / cells, 1.0 / D), shortest);
-    const bool usable = edge > 0 && std::isfinite(edge) && std::isfinite(1 / edge);
-    scale = usable ? float(1 / edge) : 0.0f;
-    int axis_bits[D];
-    for (int d = 0; d < D; ++d) {
-      last[d] = usable ? std::min(int32_t(edges[d] / edge), 1023) : 0;
-      for (axis_bits[d] = 0; (last[d] >> axis_bits[d]) != 0;) ++axis_bits[d];
-      spread[d].assign(last[d] + 1, 0);
-    }
-    for (int level = 0; level < 10; ++level)
-      for (int d = D - 1; d >= 0; --d)
-        if (level < axis_bits[d]) assign_bit(d, level);
-  }
+  ZCurve(const double* edges, double cells);
 
-  void assign_bit(int d, int level) {
-    for (int32_t cell = 0; cell <= last[d]; ++cell)
-      spread[d][cell] |= uint32_t((cell >> level) & 1) << bits;
-    ++bits;
-  }
-
-  // Items for the rows first .. first + n of points, n <= 16, keyed by their cells.
+  // Fills sorter.items with n points, those of neighboring cells after each other.
   template <class T>
-  void make_items(const T* points, const T* low, int64_t first, int n, uint64_t* items) const {
-    int32_t cell[D][16];
-    for (int d = 0; d < D; ++d) {
-      const float largest = float(last[d]);
-      float at[16] = {};
-      for (int j = 0; j < n; ++j) at[j] = float(points[(first + j) * D + d] - low[d]) * scale;
-      for (int j = 0; j < 16; ++j) {
-        at[j] = at[j] > 0 ? at[j] : 0;  // NaN, too
-        cell[d][j] = int32_t(at[j] < largest ? at[j] : largest);
-      }
-    }
-    for (int j = 0; j < n; ++j) {
-      uint32_t key = 0;
-      for (int d = 0; d < D; ++d) key |= spread[d][cell[d][j]];
-      items[j] = uint64_t(key) << 32 | uint64_t(j);
-    }
-  }
+  void sort(const T* points, const T* low, int64_t n, Sorter& sorter) const;
+
+ private:
+  void assign_bit(int d, int level);
 
   template <class T>
-  void sort(const T* points, const T* low, int64_t n, Sorter& sorter) const {
-    sorter.items.resize(n);
-    for (int64_t i = 0; i < n; i += 16) {
-      make_items(points, low, i, int(std::min<int64_t>(16, n - i)), sorter.items.data() + i);
-      for (int64_t j = i; j < std::min(n, i + 16); ++j) sorter.items[j] += uint64_t(i);
-    }
-    sorter.sort(bits);
-  }
+  void make_items(const T* points, const T* low, int64_t first, int n, uint64_t* items) const;
 };
 
 }  // namespace lardhm

@@ -1,4 +1,4 @@
-// Between torch tensors and the search: checks, dispatch by dtype and dimension, the index of a call.
+// Between torch tensors and the search: checks, dispatch by dtype and dimension.
 
 #pragma once
 
@@ -7,6 +7,8 @@
 #include <torch/csrc/stable/tensor.h>
 
 #include <cstdint>
+#include <stdexcept>
+#include <string>
 #include <type_traits>
 
 #include "search.h"
@@ -16,24 +18,11 @@ namespace lardhm {
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-// An index for the call: the one given where it fits, else one of its own.
-template <class T, int D>
-struct CallIndex {
-  AlignedArray<char> own;
-  Index index;
+[[noreturn]] inline void fail(const std::string& message) { throw std::runtime_error(message); }
 
-  CallIndex(const Tensor& given, const T* centers, int64_t count) {
-    const char* bytes = static_cast<const char*>(given.const_data_ptr());
-    if (!matches<T, D>(bytes, given.numel(), centers, count)) {
-      build_index<T, D>(centers, count, [this](int64_t size) {
-        own.allocate(size);
-        return own.data;
-      });
-      bytes = own.data;
-    }
-    index = view_of(bytes);
-  }
-};
+inline void check(bool holds, const char* rule) {
+  if (!holds) fail(rule);
+}
 
 inline Tensor tidy(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
 
@@ -48,22 +37,23 @@ T* out(const Tensor& tensor) {
 }
 
 inline void check_rows(const char* name, const Tensor& tensor, const Tensor& centers) {
-  STD_TORCH_CHECK(tensor.dim() == 2 && tensor.size(1) == centers.size(1), name,
-                  " must be (N, D) like the centers; got ", tensor.dim(), " dimensions");
-  STD_TORCH_CHECK(tensor.scalar_type() == centers.scalar_type(), name,
-                  " must have the dtype of the centers");
+  if (tensor.dim() != 2 || tensor.size(1) != centers.size(1))
+    fail(std::string(name) + " must be (N, D) like the centers; got " +
+         std::to_string(tensor.dim()) + " dimensions");
+  if (tensor.scalar_type() != centers.scalar_type())
+    fail(std::string(name) + " must have the dtype of the centers");
 }
 
 // Calls use.template operator()<T, D>() for the dtype and dimension of the centers.
 template <class Use>
 auto dispatch(const Tensor& centers, const Use& use) {
-  STD_TORCH_CHECK(centers.dim() == 2 && (centers.size(1) == 2 || centers.size(1) == 3),
-                  "centers must be (M, 2) or (M, 3)");
-  STD_TORCH_CHECK(centers.size(0) < (int64_t(1) << 30), "centers must be fewer than 2^30");
+  check(centers.dim() == 2 && (centers.size(1) == 2 || centers.size(1) == 3),
+        "centers must be (M, 2) or (M, 3)");
+  check(centers.size(0) < (int64_t(1) << 30), "centers must be fewer than 2^30");
   const bool plane = centers.size(1) == 2;
   const ScalarType type = centers.scalar_type();
-  STD_TORCH_CHECK(type == ScalarType::Float || type == ScalarType::Double,
-                  "centers must be float32 or float64");
+  check(type == ScalarType::Float || type == ScalarType::Double,
+        "centers must be float32 or float64");
   if (type == ScalarType::Float)
     return plane ? use(float{}, std::integral_constant<int, 2>{})
                  : use(float{}, std::integral_constant<int, 3>{});
@@ -71,10 +61,12 @@ auto dispatch(const Tensor& centers, const Use& use) {
                : use(double{}, std::integral_constant<int, 3>{});
 }
 
-inline void check_k(int64_t k) { STD_TORCH_CHECK(k >= 1, "k must be at least 1; got ", k); }
+inline void check_k(int64_t k) {
+  if (k < 1) fail("k must be at least 1; got " + std::to_string(k));
+}
 
 inline Tensor usable_index(const Tensor& index) {
-  STD_TORCH_CHECK(index.scalar_type() == ScalarType::Byte, "index must be a uint8 tensor");
+  check(index.scalar_type() == ScalarType::Byte, "index must be a uint8 tensor");
   return tidy(index);
 }
 
@@ -88,16 +80,16 @@ struct MapTensors {
       : centers(tidy(centers_)), raw(tidy(raw_)), weights(tidy(weights_)),
         index(usable_index(index_)), scaling{covariance_scale, min_lengthscale} {
     const int64_t count = centers.size(0), dim = centers.size(1);
-    STD_TORCH_CHECK(raw.dim() == 3 && raw.size(0) == count && raw.size(1) == dim &&
-                        raw.size(2) == dim,
-                    "raw_scale_tril must be (M, D, D), one factor per center");
-    STD_TORCH_CHECK(weights.dim() == 1 && weights.size(0) == count,
-                    "weights must be (M,), one per center");
-    STD_TORCH_CHECK(raw.scalar_type() == centers.scalar_type() &&
-                        weights.scalar_type() == centers.scalar_type(),
-                    "raw_scale_tril and weights must have the dtype of the centers");
-    STD_TORCH_CHECK(covariance_scale > 0 && min_lengthscale >= 0,
-                    "covariance_scale must be > 0 and min_lengthscale 0 or more");
+    check(raw.dim() == 3 && raw.size(0) == count && raw.size(1) == dim &&
+              raw.size(2) == dim,
+          "raw_scale_tril must be (M, D, D), one factor per center");
+    check(weights.dim() == 1 && weights.size(0) == count,
+          "weights must be (M,), one per center");
+    check(raw.scalar_type() == centers.scalar_type() &&
+              weights.scalar_type() == centers.scalar_type(),
+          "raw_scale_tril and weights must have the dtype of the centers");
+    check(covariance_scale > 0 && min_lengthscale >= 0,
+          "covariance_scale must be > 0 and min_lengthscale 0 or more");
   }
 };
 
@@ -106,7 +98,8 @@ constexpr int64_t kPointsOfFew = 64;  // fewer than clusters / 64: parameters pa
 // Runs `work(parameters)` with all of a map's parameters, for a query of n points.
 template <class T, int D, class Work>
 void with_parameters(const MapTensors& map, int64_t n, const Work& work) {
-  const CallIndex<T, D> call(map.index, in<T>(map.centers), map.centers.size(0));
+  const CallIndex<T, D> call(in<char>(map.index), map.index.numel(), in<T>(map.centers),
+                             map.centers.size(0));
   Parameters<T, D> parameters(call.index, in<T>(map.centers), in<T>(map.raw), in<T>(map.weights),
                               map.scaling, n >= map.centers.size(0) / kPointsOfFew);
   work(parameters);

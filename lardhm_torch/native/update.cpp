@@ -67,7 +67,7 @@ Explained explain(const Tensor& given_points, const Tensor& centers, const Tenso
   const Tensor points = tidy(given_points);
   check_rows("points", points, centers);
   const int64_t count = centers.size(0), dim_size = centers.size(1), n = points.size(0);
-  STD_TORCH_CHECK(count > 0, "centers must hold at least one row");
+  check(count > 0, "centers must hold at least one row");
   const Tensor weights = torch::stable::new_zeros(centers, {count});
   const Tensor no_index = torch::stable::new_empty(centers, {0}, ScalarType::Byte);
   const MapTensors map(centers, raw, weights, no_index, 1.0, 0.0);
@@ -82,10 +82,11 @@ Explained explain(const Tensor& given_points, const Tensor& centers, const Tenso
     with_parameters<T, D>(map, n, [&](Parameters<T, D>& parameters) {
       const int64_t bytes = count * kMoments<D> * sizeof(double);
       MomentParts<D> moments(count, parts_of(n, bytes, parameters));
-      visit_parts<T, D>(in<T>(points), n, parameters, 1, moments.parts, [&](int64_t part) {
-        return std::make_unique<ExplainVisitor<T, D>>(
-            parameters, radius, reach, out<int32_t>(std::get<0>(result)), moments.part(part));
-      });
+      std::vector<ExplainVisitor<T, D>> visitors;
+      for (int64_t part = 0; part < moments.parts; ++part)
+        visitors.emplace_back(parameters, radius, reach, out<int32_t>(std::get<0>(result)),
+                              moments.part(part));
+      visit_parts<T, D>(in<T>(points), n, parameters, 1, each_of<T, D>(visitors));
       moments.write(parameters.index.order, out<T>(std::get<1>(result)),
                     out<T>(std::get<2>(result)), out<T>(std::get<3>(result)));
     });
