@@ -1,4 +1,4 @@
-"""Maps to surfaces: marching cubes in blocks, faces that data supports, colored vertices."""
+"""Maps to surfaces: marching cubes in blocks, faces that data supports, moved to where hits lie."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.native import nearest_centers
+from lardhm_torch.coloring import COLORS, vertex_colors
 from lardhm_torch.querying import (
     EVIDENCE,
+    SURFACES,
     cluster_boxes,
     grid_axes,
     lattice_values,
-    local_parts,
+    nearest_support,
     pieces,
 )
+from lardhm_torch.ridge import CHUNK_VERTICES, mesh_on_ridge
 
 if TYPE_CHECKING:
     import trimesh
 
 BLOCK_CELLS = 24  # cells along a block's edge
-CHUNK_VERTICES = 1 << 18  # vertices probed at a time
 PROBES = (1.0, 2.0, 3.0)  # standard deviations before and behind a face where evidence is sought
-COLORS = ("height", "cluster", "probability", "variance")
 
 
 def extract_mesh(
@@ -36,15 +36,24 @@ def extract_mesh(
     threshold: float = 0.5,
     bounds: tuple[Any, Any] | None = None,
     *,
+    surface: str = "peak",
     color: str | None = "height",
     evidence: float | None = EVIDENCE,
     progress: bool = False,
 ) -> trimesh.Trimesh:
-    """The surface on which the map's probability equals a threshold, normals into free space.
+    """The surface of what is occupied, normals into free space.
 
-    Marching cubes on the log-odds, in blocks of which only those near a supporting cluster are
-    evaluated. Supporting are the clusters that pull away from 1/2 to the threshold's side: positive
-    weights for a threshold of 1/2 or more, negative ones below.
+    Marching cubes on the log-odds find where the probability equals the threshold, in blocks of
+    which only those near a supporting cluster are evaluated. Supporting are the clusters that pull
+    away from 1/2 to the threshold's side: positive weights for a threshold of 1/2 or more, negative
+    ones below. Then
+
+    - ``surface="peak"`` moves every vertex to the ridge of the log-odds behind it, where the hits
+      lie, and leaves out faces that no one ridge is behind (`ridge.mesh_on_ridge`). Both faces of
+      a thing thinner than the kernels meet in the middle of it.
+    - ``surface="crossing"`` leaves it where the probability equals the threshold. At 1/2 this is
+      5 to 10 cm in front of the surface, because free space is learned only up to some centimeters
+      before the hits: closed around everything occupied, and on the safe side for a robot.
 
     Where data ends, both classes' tails vanish and log-odds wander around 0, so the level set at 1/2
     has sheets there, and backs of walls, that nothing was measured for. A face is kept only if the
@@ -57,6 +66,7 @@ def extract_mesh(
         resolution: edge of a lattice cell [m].
         threshold: probability of occupancy on the surface, between 0 and 1.
         bounds: lower and upper corner of the part to mesh, world frame [m]; left out: all of it.
+        surface: "peak" or "crossing", as for `rays.raycast`.
         color: of the vertices: "height", "cluster" (one color for each nearest supporting
             cluster), "probability" (at the center of that cluster), or None.
         evidence: log-odds on both sides of a face, see above; None keeps all faces.
@@ -70,9 +80,12 @@ def extract_mesh(
 
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
-    _check_meshing(model, resolution, threshold, color, evidence)
+    _check_meshing(model, resolution, threshold, evidence)
+    for name, value, known in (("surface", surface, SURFACES), ("color", color, (*COLORS, None))):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {value!r}")
     lattice = surface_lattice(model, resolution, threshold, bounds, progress=progress)
-    return lattice_mesh(model, lattice, threshold, color=color, evidence=evidence)
+    return lattice_mesh(model, lattice, threshold, surface=surface, color=color, evidence=evidence)
 
 
 class SurfaceLattice(NamedTuple):
@@ -122,27 +135,28 @@ def lattice_mesh(
     lattice: SurfaceLattice,
     threshold: float = 0.5,
     *,
+    surface: str = "peak",
     color: str | None = "height",
     evidence: float | None = EVIDENCE,
 ) -> trimesh.Trimesh:
     """As `extract_mesh`, on a lattice that was made for this map and this side of 1/2."""
+    import trimesh
+
     level = math.log(threshold / (1 - threshold))
     vertices, faces = _march_blocks(lattice.blocks, level)
-    if len(faces) == 0:
-        return _to_mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     world = vertices * lattice.resolution + lattice.corner.numpy()
-    support = _nearest_support(model, world, _side(threshold))
-    mesh = _to_mesh(world, faces, _vertex_colors(model, world, support, color))
-    if evidence is not None:
-        seen = _has_evidence(model, mesh, support.thickness, level, evidence)
+    mesh = trimesh.Trimesh(world, faces, process=False)
+    if len(faces) and evidence is not None:
+        seen = _has_evidence(model, mesh, _side(threshold), level, evidence)
         mesh.update_faces(seen[faces].all(axis=1))
-    mesh.remove_unreferenced_vertices()
-    return mesh
+        mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) and surface == "peak":
+        mesh = mesh_on_ridge(model, mesh, lattice.resolution)
+    colors = vertex_colors(model, mesh.vertices, _side(threshold), color)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
 
 
-def _check_meshing(
-    model: Any, resolution: float, threshold: float, color: str | None, evidence: float | None
-) -> None:
+def _check_meshing(model: Any, resolution: float, threshold: float, evidence: float | None) -> None:
     if model.dim != 3:
         raise ValueError(
             f"a mesh needs a 3-D map; got {model.dim}-D. For 2-D use query_slice or query_grid"
@@ -153,8 +167,6 @@ def _check_meshing(
         raise ValueError(f"resolution must be > 0 m and finite; got {resolution}")
     if not 0 < threshold < 1:
         raise ValueError(f"threshold must be between 0 and 1, both excluded; got {threshold}")
-    if color is not None and color not in COLORS:
-        raise ValueError(f"color must be one of {', '.join(COLORS)}, or None; got {color!r}")
     if evidence is not None and not evidence >= 0:
         raise ValueError(f"evidence must be >= 0, or None to keep all faces; got {evidence}")
 
@@ -233,46 +245,20 @@ def _join(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return vertices[kept], faces[~collapsed]
 
 
-class _Support(NamedTuple):
-    """Of V vertices: center (V, 3) float64 world [m] of the nearest supporting cluster, and its
-    smallest standard deviation (V,) [m]; NaN and 0 where nothing supports.
-    """
-
-    centers: Tensor
-    thickness: Tensor
-
-
 def _side(threshold: float) -> int:
     """Sign of the weights that pull away from 1/2 to the threshold's side."""
     return 1 if threshold >= 0.5 else -1
 
 
 @torch.no_grad()
-def _nearest_support(model: Any, world: np.ndarray, sign: int) -> _Support:
-    points = torch.as_tensor(world, device=model.origin.device)
-    support = _Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
-    for rows, part in local_parts(model, points, points):
-        supporters = (part.weights * sign > 0).nonzero().squeeze(1)
-        if len(supporters) == 0:
-            continue
-        centers = part.centers.detach()[supporters]
-        local = (points[rows] - part.origin).to(centers.dtype)
-        nearest = nearest_centers(local, centers, 1).squeeze(1)
-        stds = torch.linalg.svdvals(part.scale_tril.detach()[supporters].double())
-        support.centers[rows] = centers[nearest].double() + part.origin
-        support.thickness[rows] = stds[nearest, -1]
-    return support
-
-
-@torch.no_grad()
 def _has_evidence(
-    model: Any, mesh: trimesh.Trimesh, thickness: Tensor, level: float, evidence: float
+    model: Any, mesh: trimesh.Trimesh, side: int, level: float, evidence: float
 ) -> np.ndarray:
     """(V,) whether log-odds are clearly above the level behind a vertex and clearly below in front."""
     device = model.origin.device
     vertices = torch.as_tensor(np.array(mesh.vertices), device=device)
     normals = torch.as_tensor(np.array(mesh.vertex_normals), device=device)
-    steps = normals * thickness[:, None]
+    steps = normals * nearest_support(model, vertices, side).thickness[:, None]
     depths = torch.tensor(PROBES, dtype=torch.float64, device=device)[:, None, None]
     result = []
     for start, step in zip(
@@ -282,45 +268,3 @@ def _has_evidence(
         behind = model.log_odds(start - depths * step).amax(dim=0)
         result.append((in_front < level - evidence) & (behind > level + evidence))
     return torch.cat(result).cpu().numpy()
-
-
-def _vertex_colors(
-    model: Any, world: np.ndarray, support: _Support, color: str | None
-) -> np.ndarray | None:
-    """(V, 4) RGBA of the vertices, or None for no colors."""
-    from matplotlib import colormaps
-
-    if color is None or len(world) == 0:
-        return None
-    if color == "cluster":
-        return colormaps["tab20"](_shades(support.centers), bytes=True)
-    if color == "probability":
-        with torch.no_grad():
-            at_centers = model(support.centers).cpu().numpy()
-        return colormaps["viridis"](2 * at_centers - 1, bytes=True)
-    if color == "variance":
-        places = torch.as_tensor(world, device=model.origin.device)
-        variance = torch.cat([model.variance(part) for part in places.split(CHUNK_VERTICES)])
-        return colormaps["plasma"](_stretch(variance.double().cpu().numpy()), bytes=True)
-    return colormaps["viridis"](_stretch(world[:, 2]), bytes=True)
-
-
-def _shades(centers: Tensor) -> np.ndarray:
-    """(V,) one of 20 for each center (V, 3), by its place in millimeters: neighbors differ mostly."""
-    place = (torch.nan_to_num(centers) * 1e3).round().long().cpu()
-    mixed = (place * torch.tensor([73856093, 19349663, 83492791])).sum(dim=1)
-    return (((mixed * 2654435761) >> 16) % 20).numpy()
-
-
-def _stretch(values: np.ndarray) -> np.ndarray:
-    """Values to colors' [0, 1]; a few stray faces shall not set the scale."""
-    low, high = np.quantile(values, [0.01, 0.99])
-    return (values - low) / max(high - low, 1e-9)
-
-
-def _to_mesh(
-    vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
-) -> trimesh.Trimesh:
-    import trimesh
-
-    return trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)

@@ -14,9 +14,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from lardhm_torch.native import nearest_centers
+
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # how far a cluster reaches: exp(-3² / 2) = 1 % of its peak
 EVIDENCE = 1.0  # log-odds beyond the threshold that something measured reaches; ripple does not
+SURFACES = ("peak", "crossing")  # where a surface lies: on the ridge of log-odds, or at a level
+
+
+class Support(NamedTuple):
+    """Of N points: center (N, D) float64 world [m] of the nearest supporting cluster, and its
+    smallest standard deviation (N,) float64 [m]; NaN and 0 where nothing supports.
+    """
+
+    centers: Tensor
+    thickness: Tensor
 
 
 class Slice(NamedTuple):
@@ -171,6 +183,23 @@ def cluster_boxes(model: Any, sign: int = 0) -> tuple[Tensor, Tensor]:
     if not boxes:
         boxes = [(model.origin.new_zeros(0, model.dim),) * 2]
     return torch.cat([lower for lower, _ in boxes]), torch.cat([upper for _, upper in boxes])
+
+
+@torch.no_grad()
+def nearest_support(model: Any, points: Tensor, sign: int) -> Support:
+    """The nearest cluster whose weight has this sign, of (N, D) float64 world positions [m]."""
+    support = Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
+    for rows, part in local_parts(model, points, points):
+        supporters = (part.weights * sign > 0).nonzero().squeeze(1)
+        if len(supporters) == 0:
+            continue
+        centers = part.centers.detach()[supporters]
+        local = (points[rows] - part.origin).to(centers.dtype)
+        nearest = nearest_centers(local, centers, 1).squeeze(1)
+        stds = torch.linalg.svdvals(part.scale_tril.detach()[supporters].double())
+        support.centers[rows] = centers[nearest].double() + part.origin
+        support.thickness[rows] = stds[nearest, -1]
+    return support
 
 
 def pieces(model: Any) -> Iterable[Any]:

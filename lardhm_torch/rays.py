@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.bounding import Cells, ceiling_box, cover_cells, log_odds_ceiling
-from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, local_parts
+from lardhm_torch.querying import BLOCK_POINTS, EVIDENCE, SURFACES, local_parts
 from lardhm_torch.surface import surface_step
 
 BISECTIONS = 16  # a step of 5 cm is narrowed down to below 1 µm
@@ -25,7 +25,6 @@ RAYS_AT_ONCE = 1 << 17
 NONE = 1 << 40  # a step that no ray reaches
 MOST_CELLS = 1 << 22  # of the lattice by which empty space is skipped
 SKIP_FROM = 1 << 22  # steps of all rays from which the lattice pays for itself
-SURFACES = ("peak", "crossing")
 
 
 class _Rays(NamedTuple):

@@ -6,8 +6,11 @@ import torch
 import trimesh
 from torch import nn
 
-from lardhm_torch import LardHilbertMap, meshing
+from lardhm_torch import LardHilbertMap, meshing, ridge, sample_rays, simulate_room, split_rays
 from lardhm_torch.meshing import extract_mesh
+from lardhm_torch.metrics import mesh_metrics
+from lardhm_torch.ridge import mean_with_neighbors, mesh_on_ridge
+from lardhm_torch.simulation import room_mesh
 
 
 class GaussianMap(nn.Module):
@@ -53,6 +56,10 @@ def wall_seen_from_the_left():
     return GaussianMap(centers, torch.stack([wall, free]), [12.0, -6.0])
 
 
+def level_mesh(*arguments, **options):
+    return extract_mesh(*arguments, surface="crossing", **options)
+
+
 def radius_where(probability):
     """Distance from the center of `ball` at which it has this probability, in closed form."""
     level = math.log(probability / (1 - probability))
@@ -69,7 +76,7 @@ def random_map(seed, clusters=12):
 
 @pytest.mark.parametrize("threshold", [0.6, 0.8, 0.95])
 def test_the_mesh_of_a_ball_is_the_sphere_where_the_probability_is_the_threshold(threshold):
-    mesh = extract_mesh(ball(), 0.03, threshold, evidence=None)
+    mesh = level_mesh(ball(), 0.03, threshold, evidence=None)
     radius = radius_where(threshold)
     lengths = np.linalg.norm(mesh.vertices, axis=1)
     np.testing.assert_allclose(lengths, radius, atol=0.002)  # linear between lattice points
@@ -82,7 +89,7 @@ def test_the_mesh_of_a_ball_is_the_sphere_where_the_probability_is_the_threshold
 
 
 def test_normals_point_into_free_space():
-    mesh = extract_mesh(ball_in_free_space(), 0.05)
+    mesh = level_mesh(ball_in_free_space(), 0.05)
     assert mesh.volume > 0
     assert ((mesh.face_normals * mesh.triangles_center).sum(axis=1) > 0).all()
 
@@ -92,9 +99,9 @@ def test_normals_point_into_free_space():
 def test_the_mesh_does_not_depend_on_the_blocks(seed, cells, monkeypatch):
     model, bounds = random_map(seed), ([-1.6] * 3, [1.6] * 3)
     monkeypatch.setattr(meshing, "BLOCK_CELLS", 40)  # all of it in one block
-    whole = extract_mesh(model, 0.08, 0.7, bounds, evidence=None)
+    whole = level_mesh(model, 0.08, 0.7, bounds, evidence=None)
     monkeypatch.setattr(meshing, "BLOCK_CELLS", cells)
-    blocks = extract_mesh(model, 0.08, 0.7, bounds, evidence=None)
+    blocks = level_mesh(model, 0.08, 0.7, bounds, evidence=None)
     assert len(whole.faces) > 500
     assert blocks.is_watertight == whole.is_watertight
     assert len(blocks.vertices) == len(whole.vertices)
@@ -108,41 +115,41 @@ def test_only_blocks_near_occupied_clusters_are_evaluated():
     model = GaussianMap(
         [[0.0, 0, 0], [40.0, 40.0, 40.0]], (0.1 * torch.eye(3)).repeat(2, 1, 1), [6.0, 6.0]
     )
-    mesh = extract_mesh(model, 0.05, 0.7, color=None, evidence=None)
+    mesh = level_mesh(model, 0.05, 0.7, color=None, evidence=None)
     assert mesh.body_count == 2
     assert model.num_points < 20 * 25**3  # all blocks would be 34³ of these
 
 
 def test_the_mesh_moves_with_the_world():
     shift = torch.tensor([5e5, 4.5e6, 100.0]).double()
-    here, there = (extract_mesh(ball_in_free_space(o), 0.05) for o in (None, shift))
+    here, there = (level_mesh(ball_in_free_space(o), 0.05) for o in (None, shift))
     np.testing.assert_allclose(there.vertices - shift.numpy(), here.vertices, atol=1e-6)
     np.testing.assert_array_equal(there.faces, here.faces)
 
 
 def test_bounds_cut_the_mesh():
-    whole = extract_mesh(ball_in_free_space(), 0.05)
-    half = extract_mesh(ball_in_free_space(), 0.05, bounds=([0, -1, -1], [1, 1, 1]))
+    whole = level_mesh(ball_in_free_space(), 0.05)
+    half = level_mesh(ball_in_free_space(), 0.05, bounds=([0, -1, -1], [1, 1, 1]))
     assert half.bounds[0, 0] == pytest.approx(0.0)
     assert half.bounds[1, 0] == pytest.approx(whole.bounds[1, 0], abs=0.005)
     assert half.area == pytest.approx(whole.area / 2, rel=0.02)
 
 
 def test_bounds_away_from_every_obstacle_give_a_mesh_without_faces():
-    mesh = extract_mesh(ball(), 0.05, bounds=([10, 10, 10], [11, 11, 11]))
+    mesh = level_mesh(ball(), 0.05, bounds=([10, 10, 10], [11, 11, 11]))
     assert isinstance(mesh, trimesh.Trimesh)
     assert len(mesh.faces) == 0
 
 
 def test_a_map_that_knows_only_free_space_gives_a_mesh_without_faces():
     free = GaussianMap(torch.zeros(1, 3), 0.3 * torch.eye(3)[None], [-6.0])
-    assert len(extract_mesh(free, 0.05).faces) == 0
+    assert len(level_mesh(free, 0.05).faces) == 0
 
 
 def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
     model = wall_seen_from_the_left()
-    everything = extract_mesh(model, 0.04, evidence=None)
-    measured = extract_mesh(model, 0.04)
+    everything = level_mesh(model, 0.04, evidence=None)
+    measured = level_mesh(model, 0.04)
     assert (everything.triangles_center[:, 0] > 0.1).any()  # the back, where only tails are left
     assert 0 < len(measured.faces) < len(everything.faces)
     assert measured.triangles_center[:, 0].max() < 0
@@ -152,14 +159,14 @@ def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
 
 def test_below_one_half_the_surface_bounds_the_known_free_space():
     free = GaussianMap(torch.zeros(1, 3), SIGMA * torch.eye(3)[None], [-WEIGHT])
-    mesh = extract_mesh(free, 0.03, threshold=0.2, evidence=None)
+    mesh = level_mesh(free, 0.03, threshold=0.2, evidence=None)
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), radius_where(0.8), atol=0.002)
     assert mesh.volume < 0  # its normals point inward, into the free space
 
 
 @pytest.mark.parametrize("color", ["height", "cluster", "probability"])
 def test_every_vertex_has_a_color(color):
-    mesh = extract_mesh(random_map(2), 0.08, 0.7, color=color, evidence=None)
+    mesh = level_mesh(random_map(2), 0.08, 0.7, color=color, evidence=None)
     assert mesh.visual.kind == "vertex"
     assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 1
@@ -170,7 +177,7 @@ def test_colors_by_cluster_and_by_probability_are_those_of_the_nearest_cluster()
         [[-0.5, 0, 0], [0.5, 0, 0]], (0.2 * torch.eye(3)).repeat(2, 1, 1), [4.0, 8.0]
     )
     for color in ("cluster", "probability"):
-        mesh = extract_mesh(model, 0.05, 0.7, color=color, evidence=None)
+        mesh = level_mesh(model, 0.05, 0.7, color=color, evidence=None)
         left = mesh.vertices[:, 0] < 0
         shades = [np.unique(mesh.visual.vertex_colors[side], axis=0) for side in (left, ~left)]
         assert [len(shade) for shade in shades] == [1, 1]
@@ -184,7 +191,7 @@ def test_colors_by_variance_are_dark_where_the_map_is_sure():
     points[800:, 0] *= 0.8
     labels = (torch.arange(1600) < 800).float()
     model = LardHilbertMap().fit(points, labels).fit_uncertainty(points, labels)
-    mesh = extract_mesh(model, 0.05, color="variance", evidence=None)
+    mesh = level_mesh(model, 0.05, color="variance", evidence=None)
     variance = model.variance(torch.as_tensor(np.array(mesh.vertices))).numpy()
     brightness = np.asarray(mesh.visual.vertex_colors)[:, :3].sum(axis=1)
     low, high = np.quantile(variance, [0.2, 0.8])
@@ -193,7 +200,7 @@ def test_colors_by_variance_are_dark_where_the_map_is_sure():
 
 
 def test_without_color_the_mesh_has_none():
-    assert extract_mesh(ball_in_free_space(), 0.1, color=None).visual.kind is None
+    assert level_mesh(ball_in_free_space(), 0.1, color=None).visual.kind is None
 
 
 @pytest.mark.parametrize(
@@ -207,7 +214,7 @@ def test_without_color_the_mesh_has_none():
         ({"resolution": 0.0}, "resolution must be > 0 m and finite; got 0.0"),
         ({"resolution": math.nan}, "resolution must be > 0 m and finite; got nan"),
         ({"threshold": 0.0}, "threshold must be between 0 and 1, both excluded; got 0.0"),
-        ({"color": "pink"}, "color must be one of height, cluster, probability, variance, or None"),
+        ({"color": "pink"}, "color must be one of height, cluster, probability, variance, None"),
         ({"evidence": -1.0}, "evidence must be >= 0, or None"),
         ({"bounds": ([1, 1, 1], [0, 0, 0])}, "lower <= upper"),
         ({"bounds": ([0, 0], [1, 1])}, r"bounds must have 3 coordinates; got 2"),
@@ -215,4 +222,60 @@ def test_without_color_the_mesh_has_none():
 )
 def test_bad_arguments_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
-        extract_mesh(**{"model": ball(), **changed})
+        level_mesh(**{"model": ball(), **changed})
+
+
+def test_a_wall_lies_on_the_ridge_of_the_log_odds_and_its_level_in_front():
+    model = wall_seen_from_the_left()
+    line = torch.zeros(4001, 3).double()
+    line[:, 0] = torch.linspace(-0.2, 0.2, 4001)
+    ridge_at = float(line[model.log_odds(line).argmax(), 0])
+    meshes = [extract_mesh(model, 0.04, surface=surface) for surface in ("peak", "crossing")]
+    on_ridge, in_front = (
+        mesh.vertices[(np.abs(mesh.vertices[:, 1:]) < 0.3).all(axis=1), 0] for mesh in meshes
+    )
+    assert len(on_ridge) > 100
+    np.testing.assert_allclose(on_ridge, ridge_at, atol=0.005)
+    assert in_front.max() < ridge_at - 0.05
+
+
+def test_the_mesh_of_a_room_lies_on_its_walls():
+    train, _ = split_rays(simulate_room(seed=1), ratio=0.8, seed=1)
+    samples = sample_rays(train, seed=1)
+    model = LardHilbertMap().fit(samples.points, samples.labels, seed=1)
+    scores = {
+        surface: mesh_metrics(
+            extract_mesh(model, 0.05, surface=surface), room_mesh(), train.hits, num_points=50_000
+        )
+        for surface in ("peak", "crossing")
+    }
+    assert scores["peak"]["f_score_0.05"] > 0.85
+    assert scores["peak"]["chamfer"] < 0.5 * scores["crossing"]["chamfer"]
+
+
+def test_a_vertex_without_a_ridge_goes_the_way_of_its_neighbors():
+    values = torch.tensor([1.0, torch.nan, 3.0, torch.nan]).double()
+    spread = mean_with_neighbors(values, torch.tensor([[0, 1, 2]]))
+    torch.testing.assert_close(
+        spread, torch.tensor([2.0, 2.0, 2.0, torch.nan]).double(), equal_nan=True
+    )
+
+
+def test_a_face_whose_corners_met_different_surfaces_is_left_out(monkeypatch):
+    x = 0.05 * np.arange(20.0)
+    lines = [np.stack([x, np.full(20, y), np.zeros(20)], axis=1) for y in (0.0, 0.05)]
+    quads = np.arange(19)[:, None]
+    faces = np.concatenate([quads + np.array(corners) for corners in ([0, 1, 20], [1, 21, 20])])
+    strip = trimesh.Trimesh(np.concatenate(lines), faces, process=False)
+    depths = torch.as_tensor(np.where(strip.vertices[:, 0] < 0.5, 0.1, 0.5))
+    monkeypatch.setattr(ridge, "ridge_depths", lambda *_: depths)
+    moved = mesh_on_ridge(ball(), strip, 0.05)
+    assert 0 < len(moved.faces) < len(faces)
+    heights = np.abs(moved.vertices[:, 2])[moved.faces]
+    assert np.ptp(heights, axis=1).max() <= 0.05
+    assert {0.1, 0.5} == set(np.abs(moved.vertices[:, 2]).round(9)[[0, -1]])
+
+
+def test_another_surface_is_refused():
+    with pytest.raises(ValueError, match="surface must be one of peak, crossing; got 'ridge'"):
+        extract_mesh(ball(), surface="ridge")

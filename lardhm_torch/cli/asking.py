@@ -42,6 +42,7 @@ def mesh(arguments: argparse.Namespace) -> None:
         open_map(arguments.map),
         arguments.resolution,
         arguments.threshold,
+        surface=arguments.surface,
         color=arguments.color,
         progress=True,
     )
@@ -95,7 +96,12 @@ def render(arguments: argparse.Namespace) -> None:
         print(f"slice -> {arguments.output}")
         return
     surface = extract_mesh(
-        model, arguments.resolution, arguments.threshold, color=arguments.color, progress=True
+        model,
+        arguments.resolution,
+        arguments.threshold,
+        surface=arguments.surface,
+        color=arguments.color,
+        progress=True,
     )
     angles = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
     render_mesh(surface, arguments.output, cut_above=arguments.cut_above, **angles)

@@ -85,7 +85,7 @@ def _map_verbs(verb: Any) -> None:
     sub.add_argument("map")
     _output(sub)
     sub.add_argument("--resolution", type=float, default=0.05, help="lattice cell [m] (0.05)")
-    sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
+    _add_surface(sub)
     sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
 
     sub = verb(asking.grid)
@@ -106,7 +106,7 @@ def _map_verbs(verb: Any) -> None:
     _output(sub)
     sub.add_argument("--slice", type=float, metavar="Z", help="the probability at this height [m]")
     sub.add_argument("--resolution", type=float, default=0.05, help="lattice cell [m] (0.05)")
-    sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
+    _add_surface(sub)
     sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
     sub.add_argument("--azimuth", type=float, default=-60.0, help="of the camera [degrees] (-60)")
     sub.add_argument("--elevation", type=float, default=40.0, help="of the camera [degrees] (40)")
@@ -183,3 +183,13 @@ def _radius(sub: argparse.ArgumentParser) -> None:
 
 def _seed(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+
+
+def _add_surface(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
+    sub.add_argument(
+        "--surface",
+        choices=("peak", "crossing"),
+        default="peak",
+        help="where the hits lie, or where the probability is the threshold (peak)",
+    )

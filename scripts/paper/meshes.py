@@ -47,11 +47,15 @@ def figure_two(data: Path, folder: Path) -> dict[str, Any]:
     }
     faces = {}
     for name, model in tqdm(grids.items(), "Fig. 2", file=sys.stderr):
-        mesh = extract_mesh(model) if name == "lard_hm" else lattice_mesh(model, task, data)
+        mesh = (
+            extract_mesh(model, surface="crossing")
+            if name == "lard_hm"
+            else lattice_mesh(model, task, data)
+        )
         faces[name] = len(mesh.faces)
         _draw(mesh, folder / f"figure_2_{name}.png")
     room = (task.grid[0], task.grid[-1])
-    mesh = extract_mesh(lard, bounds=room, color="variance", evidence=None)
+    mesh = extract_mesh(lard, bounds=room, surface="crossing", color="variance", evidence=None)
     _draw(mesh, folder / "figure_2_lard_hm_variance.png")
     mesh = lattice_mesh(gps, task, data)
     variance = ask(gps.variance, torch.as_tensor(np.array(mesh.vertices)))
@@ -95,7 +99,7 @@ def figure_four(data: Path, folder: Path) -> dict[str, Any]:
         start = time.perf_counter()
         model = LardHilbertMap().fit(samples.points, samples.labels, num_clusters=count)
         trained = time.perf_counter()
-        mesh = extract_mesh(model, FIG4_RESOLUTION)
+        mesh = extract_mesh(model, FIG4_RESOLUTION, surface="crossing")
         result[name] = {
             "clusters": len(model),
             "fit_s": trained - start,
@@ -116,7 +120,7 @@ def figure_five(data: Path, folder: Path) -> dict[str, Any]:
         model.update(samples.points, samples.labels, num_clusters=NEW_CLUSTERS, seed=0)
         seconds.append(time.perf_counter() - start)
         sizes.append(len(model))
-    mesh = extract_mesh(model, FIG5_RESOLUTION)
+    mesh = extract_mesh(model, FIG5_RESOLUTION, surface="crossing")
     render_mesh(mesh, folder / "figure_5.png", size=(900, 600), **CAMERA_VIEW)
     return {
         "keyframes": rays.num_scans,
