@@ -244,9 +244,7 @@ def test_the_mesh_of_a_room_lies_on_its_walls():
     samples = sample_rays(train, seed=1)
     model = LardHilbertMap().fit(samples.points, samples.labels, seed=1)
     scores = {
-        surface: mesh_metrics(
-            extract_mesh(model, 0.05, surface=surface), room_mesh(), train.hits, num_points=50_000
-        )
+        surface: mesh_metrics(extract_mesh(model, 0.05, surface=surface), room_mesh(), train.hits)
         for surface in ("peak", "crossing")
     }
     assert scores["peak"]["f_score_0.05"] > 0.85

@@ -207,7 +207,10 @@ def test_a_mesh_has_no_seam(dtype, tmp_path, monkeypatch):
         model.weights.fill_(3.0)
     tiles = tiled(model, tmp_path, monkeypatch, block_clusters=1)
     assert len(tiles.manifest.tiles) == 8
-    single, ours = (extract_mesh(m, 0.04, 0.7, evidence=None) for m in (tiles.merge(), tiles))
+    single, ours = (
+        extract_mesh(m, 0.04, 0.7, surface="crossing", evidence=None)
+        for m in (tiles.merge(), tiles)
+    )
     assert single.is_watertight
     assert ours.is_watertight
     assert len(ours.split()) == 1
