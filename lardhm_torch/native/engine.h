@@ -23,7 +23,7 @@
 namespace lardhm {
 
 constexpr int64_t kMostPoints = 1024;  // in a region
-constexpr double kRegionPoints = 3000, kGroupPoints = 64, kSparse = 25;
+constexpr double kRegionPoints = 3000, kGroupPoints = 256, kSparse = 25;
 
 // How many sorted points share a list of blocks, a list of candidates, a register. The fewer points
 // there are a center, the more centers lie between neighbors: where they are very sparse, a point
@@ -40,7 +40,10 @@ struct Sharing {
   }
 };
 
-constexpr double kPointsPerCell = 4;     // of the Z curve
+// Cells of the Z curve hold a cube of a lattice's points, two an edge: packets of lattices in any order
+// of axes are compact.
+template <int D>
+constexpr double kPointsPerCell = 1 << D;
 
 // What one thread needs while it works through points.
 template <class T, int D>
@@ -115,7 +118,7 @@ struct Engine {
       const T high = std::min(box.high[d], T(index.header.high[d] + 0.5 * reach));
       edges[d] = std::max(double(high) - double(low[d]), 0.0);
     }
-    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) / kPointsPerCell));
+    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) / kPointsPerCell<D>));
     curve.sort(points + begin * D, low, end - begin, s.sorter);
     if (all_finite) return end - begin;
     int64_t kept = 0;

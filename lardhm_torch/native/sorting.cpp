@@ -4,9 +4,15 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
+
+#include "simd.h"
 
 namespace lardhm {
 namespace {
+
+constexpr int kRun = 16;    // rows a box takes in at a time
+constexpr int kKeyed = 128;  // rows keyed at a time: what is stored has left for the cache when it is loaded
 
 // Widens the bounds by the finite numbers of one run; sums what is not finite.
 template <int Run, class T>
@@ -24,20 +30,20 @@ void add_run(const T* run, T* lowest, T* highest, T* sum) {
 
 template <class T, int D>
 bool Box<T, D>::add(const T* points, int64_t begin, int64_t end, int64_t step) {
-  constexpr int kRun = 16 * D;
-  T lowest[kRun], highest[kRun], sum[kRun] = {};
-  for (int i = 0; i < kRun; ++i) lowest[i] = low[i % D], highest[i] = high[i % D];
-  for (int64_t row = begin; row < end; row += 16 * step) {
+  constexpr int kNumbers = kRun * D;
+  T lowest[kNumbers], highest[kNumbers], sum[kNumbers] = {};
+  for (int i = 0; i < kNumbers; ++i) lowest[i] = low[i % D], highest[i] = high[i % D];
+  for (int64_t row = begin; row < end; row += kRun * step) {
     const T* run = points + row * D;
-    if (step > 1 || row + 16 > end) {
-      for (int64_t one = row; one < std::min(end, row + 16 * step); one += step)
+    if (step > 1 || row + kRun > end) {
+      for (int64_t one = row; one < std::min(end, row + kRun * step); one += step)
         add_run<D>(points + one * D, lowest, highest, sum);
     } else {
-      add_run<kRun>(run, lowest, highest, sum);
+      add_run<kNumbers>(run, lowest, highest, sum);
     }
   }
   T total = 0;
-  for (int i = 0; i < kRun; ++i) {
+  for (int i = 0; i < kNumbers; ++i) {
     low[i % D] = std::min(low[i % D], lowest[i]);
     high[i % D] = std::max(high[i % D], highest[i]);
     total += sum[i];
@@ -56,7 +62,7 @@ void Sorter::counting_pass(int shift, int bits) {
 }
 
 void Sorter::sort(int key_bits) {
-  const int passes = key_bits <= 12 ? 1 : (key_bits + 10) / 11;
+  const int passes = key_bits <= 15 ? 1 : (key_bits + 10) / 11;
   for (int pass = 0; pass < passes; ++pass) {
     const int shift = key_bits * pass / passes;
     counting_pass(32 + shift, key_bits * (pass + 1) / passes - shift);
@@ -90,25 +96,32 @@ void ZCurve<D>::assign_bit(int d, int level) {
   ++bits;
 }
 
-// Items for the rows first .. first + n of points, n <= 16, keyed by their cells.
+// Cells along one axis of numbers in units of a cell: from 0, NaN too, up to the last.
+static void clamp_to_cells(const float* at, float last, int32_t* cell) {
+  using V = Simd<float>::V;
+  for (int j = 0; j < kKeyed; j += Simd<float>::W) {
+    V x = load<V>(at + j);
+    x = x > 0 ? x : V{};
+    const auto whole = __builtin_convertvector(x < last ? x : last - V{}, Simd<float>::I);
+    std::memcpy(cell + j, &whole, sizeof(whole));
+  }
+}
+
+// Items for the n <= kKeyed rows from `first` on, keyed by their cells.
 template <int D>
 template <class T>
 void ZCurve<D>::make_items(const T* points, const T* low, int64_t first, int n,
                            uint64_t* items) const {
-  int32_t cell[D][16];
-  for (int d = 0; d < D; ++d) {
-    const float largest = float(last[d]);
-    float at[16] = {};
-    for (int j = 0; j < n; ++j) at[j] = float(points[(first + j) * D + d] - low[d]) * scale;
-    for (int j = 0; j < 16; ++j) {
-      at[j] = at[j] > 0 ? at[j] : 0;  // NaN, too
-      cell[d][j] = int32_t(at[j] < largest ? at[j] : largest);
-    }
-  }
+  alignas(64) float at[D][kKeyed] = {};
+  alignas(64) int32_t cell[D][kKeyed];
+  const T* from = points + first * D;
+  for (int j = 0; j < n; ++j)
+    for (int d = 0; d < D; ++d) at[d][j] = float(from[j * D + d] - low[d]) * scale;
+  for (int d = 0; d < D; ++d) clamp_to_cells(at[d], float(last[d]), cell[d]);
   for (int j = 0; j < n; ++j) {
     uint32_t key = 0;
     for (int d = 0; d < D; ++d) key |= spread[d][cell[d][j]];
-    items[j] = uint64_t(key) << 32 | uint64_t(j);
+    items[j] = uint64_t(key) << 32 | uint64_t(first + j);
   }
 }
 
@@ -116,10 +129,8 @@ template <int D>
 template <class T>
 void ZCurve<D>::sort(const T* points, const T* low, int64_t n, Sorter& sorter) const {
   sorter.items.resize(n);
-  for (int64_t i = 0; i < n; i += 16) {
-    make_items(points, low, i, int(std::min<int64_t>(16, n - i)), sorter.items.data() + i);
-    for (int64_t j = i; j < std::min(n, i + 16); ++j) sorter.items[j] += uint64_t(i);
-  }
+  for (int64_t i = 0; i < n; i += kKeyed)
+    make_items(points, low, i, int(std::min<int64_t>(kKeyed, n - i)), sorter.items.data() + i);
   sorter.sort(bits);
 }
 
