@@ -41,11 +41,28 @@ struct Region {
   }
 };
 
+#if defined(__AVX2__) && !defined(LARDHM_AVX512)
+// For each set of 8 lanes the lanes in it, ascending, one a byte.
+struct LaneLists {
+  uint64_t of[256] = {};
+  constexpr LaneLists() {
+    for (int bits = 0; bits < 256; ++bits)
+      for (int lane = 0, n = 0; lane < 8; ++lane)
+        if (bits >> lane & 1) of[bits] |= uint64_t(lane) << 8 * n++;
+  }
+};
+inline constexpr LaneLists kLanes;
+#endif
+
 // Lanes of `bits` set to the front; writes a whole register.
 template <class X>
 inline void compress(uint32_t bits, const X* from, X* to) {
 #if defined(LARDHM_AVX512)
   _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(uint16_t(bits), _mm512_loadu_si512(from)));
+#elif defined(__AVX2__)
+  const __m256i lanes = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(int64_t(kLanes.of[bits & 255])));
+  _mm256_storeu_si256((__m256i*)to,
+                      _mm256_permutevar8x32_epi32(_mm256_loadu_si256((const __m256i*)from), lanes));
 #else
   for (int64_t n = 0, lane = 0; lane < kWide; ++lane) {
     to[n] = from[lane];
