@@ -8,44 +8,103 @@
 
 namespace lardhm {
 
-// The k smallest of what is inserted, lane by lane, as bits of non-negative floats.
+// Two values in order.
+template <class I>
+inline void exchange(I& a, I& b) {
+  const I low = vmin(a, b);
+  b = vmax(a, b);
+  a = low;
+}
+
+// A bitonic run of values, ascending.
+template <int N, class I>
+inline __attribute__((always_inline)) void merge_bitonic(I* value) {
+  if constexpr (N > 1) {
+    for (int i = 0; i < N / 2; ++i) exchange(value[i], value[i + N / 2]);
+    merge_bitonic<N / 2>(value);
+    merge_bitonic<N / 2>(value + N / 2);
+  }
+}
+
+// Any values, ascending.
+template <int N, class I>
+inline __attribute__((always_inline)) void sort_values(I* value) {
+  if constexpr (N > 1) {
+    sort_values<N / 2>(value);
+    sort_values<N / 2>(value + N / 2);
+    for (int i = 0; i < N / 2; ++i) exchange(value[i], value[N - 1 - i]);
+    merge_bitonic<N / 2>(value);
+    merge_bitonic<N / 2>(value + N / 2);
+  }
+}
+
+template <class I>
+inline I largest_value() {
+  return std::numeric_limits<std::decay_t<decltype(I{}[0])>>::max() - I{};
+}
+
+// The k smallest of what is inserted, lane by lane, as bits of non-negative floats: for a small k one
+// value after the other, ...
 template <class I, int K>
 struct Smallest {
-  I value[K > 0 ? K : 1];
-  std::vector<I> more;
-  int k;
+  static constexpr int kAtOnce = 1;
+  I value[K];
 
-  explicit Smallest(int k_) : k(K > 0 ? K : k_) {
-    I most = std::numeric_limits<std::decay_t<decltype(I{}[0])>>::max() - I{};
-    if constexpr (K > 0) {
-      for (int j = 0; j < K; ++j) value[j] = most;
-    } else {
-      more.assign(k, most);
-    }
+  explicit Smallest(int) {
+    for (I& v : value) v = largest_value<I>();
   }
 
-  inline void insert(I x) {
-    if constexpr (K > 0) {
+  inline void insert(I* given) {
 #pragma GCC unroll 16
-      for (int j = 0; j < K - 1; ++j) {
-        const I low = vmin(value[j], x);
-        x = vmax(value[j], x);
-        value[j] = low;
-      }
-      value[K - 1] = vmin(value[K - 1], x);
-    } else {
-      for (int j = 0; j < k; ++j) {
-        const I low = vmin(more[j], x);
-        x = vmax(more[j], x);
-        more[j] = low;
-      }
-    }
+    for (int j = 0; j < K; ++j) exchange(value[j], *given);
   }
 
-  I last() const {
-    if constexpr (K > 0) return value[K - 1];
-    return more[k - 1];
+  I last() const { return value[K - 1]; }
+};
+
+// ... for any k the same, unless it is one of the usual ones, ...
+template <class I>
+struct SmallestOfAny {
+  static constexpr int kAtOnce = 1;
+  std::vector<I> value;
+
+  explicit SmallestOfAny(int k) : value(k, largest_value<I>()) {}
+
+  inline void insert(I* given) {
+    for (I& v : value) exchange(v, *given);
   }
+
+  I last() const { return value.back(); }
+};
+
+// ... for a larger k eight together: sorted, then merged into those kept.
+template <class I, int K>
+struct SmallestOfEights {
+  static constexpr int kAtOnce = 8, kKept = K > 8 ? 16 : 8;
+  I value[kKept];
+
+  explicit SmallestOfEights(int) {
+    for (I& v : value) v = largest_value<I>();
+  }
+
+  inline __attribute__((always_inline)) void insert(I* given) {
+    sort_values<kAtOnce>(given);
+    I* upper = value + kKept - kAtOnce;
+    for (int i = 0; i < kAtOnce; ++i) upper[i] = vmin(upper[i], given[kAtOnce - 1 - i]);
+    merge_bitonic<kKept>(value);
+  }
+
+  I last() const { return value[K - 1]; }
+};
+
+template <class I, int K>
+struct KeptFor {
+  using Type = std::conditional_t<(K >= 8), SmallestOfEights<I, K>, Smallest<I, K>>;
+};
+
+template <class I>
+struct KeptFor<I, 0> {
+  using Type = SmallestOfAny<I>;
 };
 
 // A product that is rounded before it is added to anything.
@@ -69,16 +128,23 @@ typename Simd<T>::I kth_distance(const Packet<T, D>& packet, const T* positions,
                                  typename Simd<T>::I* distance) {
   using V = typename Simd<T>::V;
   using I = typename Simd<T>::I;
-  Smallest<I, K> smallest(k);
-  for (int64_t i = 0; i < n; ++i) {
+  using Kept = typename KeptFor<I, K>::Type;
+  Kept smallest(k);
+  const auto squared_distance = [&](int64_t i) {
     const T* center = positions + int64_t(list[i]) * Layout<D>::position;
     V squared = {};
     for (int d = 0; d < D; ++d) {
       const V offset = packet.x[d] - center[d];
       squared = d == 0 ? rounded(offset * offset) : squared + rounded(offset * offset);
     }
-    distance[i] = (I)squared;
-    smallest.insert((I)squared);
+    return distance[i] = (I)squared;
+  };
+  constexpr int kAtOnce = Kept::kAtOnce;
+  I together[kAtOnce];
+  for (int64_t i = 0; i < n; i += kAtOnce) {
+    for (int j = 0; j < kAtOnce; ++j)
+      together[j] = i + j < n ? squared_distance(i + j) : largest_value<I>();
+    smallest.insert(together);
   }
   return smallest.last();
 }
