@@ -52,7 +52,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
         config,
         max_clusters=6_800,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(config.update, max_points=20_000, replay=3, fit=fit),
+        update=replace(config.update, replay=3, fit=fit),
     )
 
 
