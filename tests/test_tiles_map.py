@@ -146,11 +146,15 @@ def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, mon
 def test_points_may_have_any_leading_shape_and_order(tmp_path, monkeypatch):
     tiles = tiled(random_map(), tmp_path, monkeypatch)
     points = border_points(tiles, 600)
-    expected = tiles(points)
-    order = torch.randperm(600)
-    assert torch.equal(tiles(points[order]), expected[order])
-    assert torch.equal(tiles(points.reshape(5, 6, 20, 3)), expected.reshape(5, 6, 20))
-    assert torch.equal(tiles(points[7]), expected[7])
+    expected = tiles.log_odds(points)
+    order = torch.randperm(600, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(tiles.log_odds(points[order]), expected[order])
+    assert torch.equal(tiles.log_odds(points.reshape(5, 6, 20, 3)), expected.reshape(5, 6, 20))
+    assert torch.equal(tiles.log_odds(points[7]), expected[7])
+    # torch.sigmoid rounds the last few numbers of a tensor, those that fill no vector register,
+    # otherwise than the rest: the last bit of a probability depends on its place.
+    one_bit = {"rtol": 2 * torch.finfo(F64).eps, "atol": 0}
+    torch.testing.assert_close(tiles(points[order]), torch.sigmoid(expected[order]), **one_bit)
     assert tiles(points[:0]).shape == (0,)
     grouped = points[tile_indices(points, tiles.origin, EDGE)[:, 0].argsort()]
     torch.testing.assert_close(tiles(grouped), tiles.merge()(grouped))
