@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_PARTIAL = re.compile(r"\.[0-9a-f]{8}\..+")  # name of a file that is not yet whole
 
 
 @contextmanager
@@ -48,3 +51,10 @@ def replaced_file(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
         os.replace(partial, target)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def remove_partials(folder: str | os.PathLike[str]) -> None:
+    """Remove what writers that were killed left in a folder. No one may be writing there."""
+    for path in Path(folder).iterdir():
+        if _PARTIAL.fullmatch(path.name) and path.is_file():
+            path.unlink()

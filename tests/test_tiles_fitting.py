@@ -134,6 +134,17 @@ def test_a_job_that_failed_while_tiles_were_taken_over_goes_on(fitted, tmp_path,
     assert contents(folder) == contents(fitted)
 
 
+def test_what_a_killed_job_left_half_written_is_gone_at_the_end(fitted, tmp_path):
+    folder = room_folder(tmp_path / "room")
+    (folder / "clusters").mkdir()
+    for name in ("clusters/.1ba2c849.1_-2_-1", ".00ffab12.manifest.json"):
+        (folder / name).write_bytes(b"cut")
+    (folder / ".notes").write_text("of someone else")
+    fit_tiles(folder)
+    (folder / ".notes").unlink()
+    assert contents(folder) == contents(fitted)
+
+
 @pytest.mark.parametrize(("seed", "launcher"), [(0, []), (1, [*TORCHRUN, "2"])])
 def test_killed_at_a_random_moment_the_job_ends_with_the_same_files(
     fitted, tmp_path, seed, launcher

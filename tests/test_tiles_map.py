@@ -1,10 +1,17 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from small_maps import wall_map
-from tiled_maps import EDGE, F64, border_points, random_map, reframed, tiled
+from tiled_maps import (
+    EDGE,
+    F64,
+    border_points,
+    exact_map,
+    moved_away,
+    random_map,
+    reframed,
+    tiled,
+)
 
 from lardhm_torch import LardHilbertMap, TiledMap, extract_mesh, raycast, sample_rays
 from lardhm_torch.exploring import frontiers
@@ -15,8 +22,7 @@ from lardhm_torch.segments import expected_range, segment_hazard
 from lardhm_torch.surface import surface_step, thickness_counts
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
-from lardhm_torch.tiles.manifest import write_manifest
-from lardhm_torch.tiles.places import tile_indices, tile_path
+from lardhm_torch.tiles.places import tile_indices
 from lardhm_torch.tiles.store import cluster_bytes, joined, state_of
 
 TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
@@ -63,27 +69,58 @@ def test_tiles_of_different_frames_answer_as_one(dtype, tmp_path, monkeypatch):
 
 @both
 def test_far_from_the_origin_parts_keep_their_digits(dtype, tmp_path, monkeypatch):
-    """A map at 100 km, where float32 in the map's frame would know no centimeters."""
+    """A map at 175 km, where float32 in the map's frame would know no centimeters."""
     model = random_map(2, dtype=dtype)
-    tiled(model, tmp_path, monkeypatch)
-    tiles = reframed(TiledMap.open(tmp_path / "tiles"))
+    tiles = reframed(tiled(model, tmp_path, monkeypatch))
     points = border_points(tiles, 1000)
-    origin = tuple(value - 25_000 * EDGE for value in tiles.manifest.origin)
-    moved = {tuple(i + 25_000 for i in index): t for index, t in tiles.manifest.tiles.items()}
-    for index, there in zip(tiles.manifest.tiles, moved, strict=True):
-        tile_path(tiles.folder, index).rename(tile_path(tiles.folder, there))
-    write_manifest(tiles.folder, replace(tiles.manifest, origin=origin, tiles=moved))
-    far = TiledMap.open(tiles.folder)
+    far = moved_away(tiles, 25_000)
     assert (far(points) - model.double()(points)).abs().median() < 1e-6
+
+
+@torch.no_grad()
+def test_in_float32_two_places_2_km_apart_are_both_answered_as_near_one_origin(
+    tmp_path, monkeypatch
+):
+    """They have so few clusters that one block could hold both, but no one frame would do."""
+    here, there = random_map(2), random_map(3)
+    there.origin[0] += 286 * EDGE
+    model = joined([state_of(m) for m in (here, there)], here.settings, here.origin).float()
+    tiles = reframed(tiled(model, tmp_path, monkeypatch, block_clusters=layout.BLOCK_CLUSTERS))
+    points = border_points(tiles, 8000)[:4000]  # those near clusters
+    truth, is_far = exact_map(tiles)(points), points[:, 0] > 1000
+    ours, theirs = ((m(points) - truth).abs() for m in (tiles, tiles.merge()))
+    torch.testing.assert_close(ours[~is_far], theirs[~is_far], rtol=0, atol=1e-6)
+    assert ours.max() < 1e-4
+    assert ours[is_far].mean() < theirs[is_far].mean() / 10
+
+
+def real_map(folder):
+    """A map of few rays, and enough clusters for several blocks."""
+    scans, _ = split_rays(load_scans(folder), 0.03, seed=0)
+    samples = sample_rays(scans, seed=0)
+    return LardHilbertMap().fit(samples.points, samples.labels)
+
+
+@pytest.mark.parametrize("name", ["kitti00_mulls", "balm_realworld"])
+@torch.no_grad()
+def test_2_km_from_the_origin_float32_tiles_of_real_maps_are_nearer_to_float64_than_one_map(
+    name, data, tmp_path
+):
+    tiles = moved_away(TiledMap.split(real_map(data / name), tmp_path / "tiles", 15.0), 134)
+    points = border_points(tiles, 100_000)
+    truth = exact_map(tiles)(points)
+    ours, theirs = ((m(points) - truth).abs() for m in (tiles, tiles.merge()))
+    assert ours.median() < 2e-8
+    assert ours.max() < 1e-4
+    assert theirs.median() > 5e-7
+    assert theirs.max() > 1e-2
 
 
 @pytest.mark.parametrize("name", ["kitti00_mulls", "balm_realworld"])
 def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
     name, data, tmp_path, monkeypatch
 ):
-    scans, _ = split_rays(load_scans(data / name), 0.03, seed=0)
-    samples = sample_rays(scans, seed=0)
-    model = LardHilbertMap().fit(samples.points, samples.labels)
+    model = real_map(data / name)
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 300)
     for dtype in (torch.float32, F64):
         tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 15.0)
@@ -146,11 +183,15 @@ def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, mon
 def test_points_may_have_any_leading_shape_and_order(tmp_path, monkeypatch):
     tiles = tiled(random_map(), tmp_path, monkeypatch)
     points = border_points(tiles, 600)
-    expected = tiles(points)
-    order = torch.randperm(600)
-    assert torch.equal(tiles(points[order]), expected[order])
-    assert torch.equal(tiles(points.reshape(5, 6, 20, 3)), expected.reshape(5, 6, 20))
-    assert torch.equal(tiles(points[7]), expected[7])
+    expected = tiles.log_odds(points)
+    order = torch.randperm(600, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(tiles.log_odds(points[order]), expected[order])
+    assert torch.equal(tiles.log_odds(points.reshape(5, 6, 20, 3)), expected.reshape(5, 6, 20))
+    assert torch.equal(tiles.log_odds(points[7]), expected[7])
+    # torch.sigmoid rounds the last few numbers of a tensor, those that fill no vector register,
+    # otherwise than the rest: the last bit of a probability depends on its place.
+    one_bit = {"rtol": 2 * torch.finfo(F64).eps, "atol": 0}
+    torch.testing.assert_close(tiles(points[order]), torch.sigmoid(expected[order]), **one_bit)
     assert tiles(points[:0]).shape == (0,)
     grouped = points[tile_indices(points, tiles.origin, EDGE)[:, 0].argsort()]
     torch.testing.assert_close(tiles(grouped), tiles.merge()(grouped))

@@ -57,6 +57,29 @@ def reframed(tiles):
     return TiledMap.open(tiles.folder)
 
 
+def moved_away(tiles, steps):
+    """The same folder with the map's origin so many tiles away along each axis; opened anew.
+
+    Where the world is stays as it is, and every tile keeps its own frame.
+    """
+    manifest = tiles.manifest
+    origin = tuple(value - steps * manifest.edge for value in manifest.origin)
+    moved = {tuple(i + steps for i in index): tile for index, tile in manifest.tiles.items()}
+    for index, there in zip(sorted(manifest.tiles), sorted(moved), strict=True):
+        tile_path(tiles.folder, index).rename(tile_path(tiles.folder, there))
+    write_manifest(tiles.folder, replace(manifest, origin=origin, tiles=moved))
+    return TiledMap.open(tiles.folder)
+
+
+def exact_map(tiles):
+    """The float64 map of all tiles in one piece, with the very numbers that they hold."""
+    states = [
+        state_of(LardHilbertMap.load(tile_path(tiles.folder, i)).double())
+        for i in tiles.manifest.tiles
+    ]
+    return joined(states, tiles.settings, tiles.origin)
+
+
 def border_points(tiles, count, seed=0, within=0.5):
     """World positions near clusters and elsewhere, one coordinate within so much of a border [m]."""
     rng = torch.Generator().manual_seed(seed)

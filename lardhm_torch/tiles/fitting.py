@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lardhm_torch.files import replaced_file
+from lardhm_torch.files import remove_partials, replaced_file
 from lardhm_torch.fitting import FitConfig
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.map_state import MapState, write_state
@@ -247,6 +247,8 @@ class _Job:
                 os.replace(path, tile_path(self.folder, index))
         write_manifest(self.folder, replace(self.manifest, tiles={**self.manifest.tiles, **found}))
         shutil.rmtree(self.folder / "fitted")
+        for folder in (self.folder, self.folder / "clusters"):
+            remove_partials(folder)
 
 
 def _is_whole(path: Path, entry: Tile) -> bool:

@@ -28,6 +28,7 @@ from lardhm_torch.tiles.manifest import Manifest
 from lardhm_torch.tiles.places import Index
 
 BLOCK_CLUSTERS = 1 << 17  # of a block of tiles that are held as one map, about 20 MB
+BLOCK_EDGE = 512.0  # [m] at most, or one tile: a block has one frame, for float32 positions
 _CELLS = 1 << 12  # of a box at most; larger boxes have larger cells
 _PAIRS = 1 << 20  # of cells and tiles at a time
 _SLACK = 1e-4  # [m] added to radii: centers and points are rounded to float32
@@ -78,21 +79,25 @@ def layout_of(manifest: Manifest) -> Layout:
         origin=torch.tensor(manifest.origin, dtype=torch.float64) + manifest.edge * lowest,
         edge=float(manifest.edge),
         num_neighbors=int(manifest.settings["num_neighbors"]),
-        block_tiles=_block_tiles(indices, counts, dim),
+        block_tiles=_block_tiles(indices, counts, manifest),
     )
 
 
-def _block_tiles(indices: list[Index], counts: Tensor, dim: int) -> int:
-    """Largest power of two with at most `BLOCK_CLUSTERS` clusters in the fullest block."""
+def _block_tiles(indices: list[Index], counts: Tensor, manifest: Manifest) -> int:
+    """Largest power of two with no block wider than `BLOCK_EDGE` or fuller than `BLOCK_CLUSTERS`."""
     if not indices:
         return 1
-    places = torch.tensor(indices, dtype=torch.long).reshape(-1, dim)
+    places = torch.tensor(indices, dtype=torch.long).reshape(-1, manifest.dim)
     places = places - places.amin(dim=0)
     size = 1 << int(places.max()).bit_length()
-    while size > 1:
+
+    def fits(size: int) -> bool:
+        if size * manifest.edge > BLOCK_EDGE:
+            return False
         _, block = torch.unique(places.div(size, rounding_mode="floor"), dim=0, return_inverse=True)
-        if int(torch.bincount(block, counts.double()).max()) <= BLOCK_CLUSTERS:
-            break
+        return int(torch.bincount(block, counts.double()).max()) <= BLOCK_CLUSTERS
+
+    while size > 1 and not fits(size):
         size //= 2
     return size
 

@@ -65,8 +65,8 @@ class Parts:
         """A new map that answers in a box (D,) to (D,), or, None, everywhere."""
         if bounds is None:
             return self._joined(list(self._tiles()), self.origin)
-        rows = needed_tiles(self.layout, *bounds).tolist()
-        return self._joined([self._tile(row) for row in rows])
+        rows = needed_tiles(self.layout, *bounds)
+        return self._joined([self._tile(row) for row in rows.tolist()], self._frame(rows))
 
     def whole(self) -> LardHilbertMap:
         """The map of all tiles, kept."""
@@ -96,7 +96,7 @@ class Parts:
                     tiles.append(self._tile(row))
                 except DamagedTileError as error:
                     missing[row] = error
-            model = self._joined(tiles)
+            model = self._joined(tiles, self._frame(rows))
             self.cache.put_map(key, model)
             self._missing[key] = missing
         if self._missing[key]:
@@ -117,22 +117,23 @@ class Parts:
             self.cache.put_tile(index, state)
         return state
 
-    def _joined(self, tiles: list[TileState], origin: Tensor | None = None) -> LardHilbertMap:
-        """One map of tiles.
+    def _frame(self, rows: Tensor) -> Tensor:
+        """Origin (D,) world [m] of a map of tiles (S,).
 
-        Near the map's origin it has that frame, like the whole in one piece: in another, float32
+        Near the map's origin it is that one, as of the whole in one piece: in another frame, float32
         would round points and centers otherwise, and who is the k-th nearest is sometimes a matter
         of the last digit. Farther away that frame would lose what float32 can tell apart in one
-        amid the tiles.
+        amid the clusters.
         """
-        if origin is None:
-            origin = self.origin
-            if tiles:
-                origins = torch.stack([tile["origin"] for tile in tiles])
-                lower, upper = origins.amin(dim=0), origins.amax(dim=0)
-                far = torch.maximum(upper - self.origin, self.origin - lower).max()
-                if far > SAME_FRAME:
-                    origin = ((lower + upper) / 2).round()
+        if len(rows) == 0:
+            return self.origin
+        lower, upper = self.layout.lower[rows].amin(dim=0), self.layout.upper[rows].amax(dim=0)
+        origin = self.origin.cpu()
+        if torch.maximum(upper - origin, origin - lower).max() <= SAME_FRAME:
+            return self.origin
+        return ((lower + upper) / 2).round().to(self.origin)
+
+    def _joined(self, tiles: list[TileState], origin: Tensor) -> LardHilbertMap:
         model = joined(tiles, self.store.manifest.settings, origin)
         return model.to(self.store.device, self.store.dtype)
 
