@@ -10,17 +10,19 @@ seconds, and the frames of the page are counted; all drawing is done by the proc
 import argparse
 import contextlib
 import os
-import shutil
+import sys
 import time
 from pathlib import Path
 
 from conditions import conditions, describe
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays
 from lardhm_torch.viewer import MapViewer, ViewConfig
 
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from chromium import chromium
+
 SECONDS = 12
 COUNT = """() => { window.frames_drawn = 0;
     const next = () => { window.frames_drawn++; requestAnimationFrame(next); };
@@ -74,10 +76,7 @@ def main() -> None:
     model = LardHilbertMap().fit(samples.points, samples.labels)
     viewer = MapViewer(model, scans, ViewConfig(port=8123, max_points=arguments.most_points))
     viewer.wait()
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=shutil.which("chromium"), headless=True, args=FLAGS
-        )
+    with chromium() as browser:
         page = browser.new_page(viewport={"width": 1200, "height": 760})
         page.set_default_timeout(300_000)
         page.goto(viewer.url)
@@ -99,7 +98,6 @@ def main() -> None:
                 f"{taken:.2f} s of the processors a frame",
                 flush=True,
             )
-        browser.close()
     viewer.close()
 
 

@@ -3,16 +3,13 @@
 Usage: python scripts/screenshot_viewer.py SCANS [PICTURE]    (default: docs/pictures/viewer.png)
 """
 
-import shutil
 import sys
 from pathlib import Path
 
-from playwright.sync_api import sync_playwright
+from chromium import chromium
 
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays
 from lardhm_torch.viewer import MapViewer
-
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 def main(scans_path: str, picture: Path) -> None:
@@ -20,10 +17,7 @@ def main(scans_path: str, picture: Path) -> None:
     scans = load_scans(scans_path)
     samples = sample_rays(scans)
     viewer = MapViewer(LardHilbertMap().fit(samples.points, samples.labels), scans)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=shutil.which("chromium"), headless=True, args=FLAGS
-        )
+    with chromium() as browser:
         page = browser.new_page(viewport={"width": 1200, "height": 760})
         page.set_default_timeout(600_000)
         page.goto(viewer.url)
@@ -34,7 +28,6 @@ def main(scans_path: str, picture: Path) -> None:
             page.locator(".mantine-Notification-closeButton").first.click()
         page.wait_for_timeout(15_000)
         page.screenshot(path=picture)
-        browser.close()
     viewer.close()
 
 

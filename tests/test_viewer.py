@@ -1,28 +1,17 @@
 import importlib.util
 import io
 import json
-import shutil
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from chromium import chromium, chromium_path
 from scipy.spatial import cKDTree
 
 from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, scene, simulate_room
 from lardhm_torch.viewer import LiveView, MapViewer, ViewConfig
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 PATIENCE = 120_000  # [ms] a shared machine draws in software
 
 pytestmark = pytest.mark.skipif(
@@ -44,14 +33,11 @@ def model(scans):
 @pytest.fixture(scope="module")
 def browser():
     """A real Chromium; the test is skipped with a reason where there is none."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
-    if path is None:
+    pytest.importorskip("playwright", reason="playwright is not installed")
+    if chromium_path() is None:
         pytest.skip("no Chromium is installed")
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS)
-        yield chromium
-        chromium.close()
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture
