@@ -45,6 +45,7 @@ void add_gradient(const Rows<T>& rows, int64_t begin, int64_t end, const T* __re
     for (int lane = 0; lane < lanes; ++lane) {
       const int32_t* index = rows.indices + (first + lane) * k;
       const T* value = rows.values + (first + lane) * k;
+      asm("" : "+r"(index));  // else weights of many rows are gathered at once: half as long again
       T sum = 0;
       for (int64_t j = 0; j < k; ++j) sum += value[j] * weights[index[j]];
       log_odds[lane] = sum;
