@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lardhm_torch.querying import query_slice
 from lardhm_torch.scans import Scans
-from lardhm_torch.surface import surface_step
 
 if TYPE_CHECKING:
     import trimesh
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 SLICE_PIXELS = 512  # along the longer edge
 MESH_FACES = 200_000  # about; the resolution is chosen for it
 MOST_FACES = 1_000_000  # about; where surfaces are so thin that they need finer cells
-SHEET_CELLS = 1.5  # thicknesses: of cells larger than that, thin sheets slip through
+SHEET_CELLS = 1.5  # thicknesses: through larger cells thin sheets slip
 SHOWN_FACES = 60_000  # of a surface on the page
 KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light that is painted on
 
@@ -38,8 +37,8 @@ def view_resolution(model: Any) -> float:
     """Edge of a cell [m] at which the surface has about `MESH_FACES` faces.
 
     The clusters lie on the surface like tiles of two standard deviations to each side. Where they
-    are thin, cells are smaller, for up to about `MOST_FACES`: between the nodes of a lattice coarser
-    than a floor is thick the floor is missed, and has holes.
+    are thin (a quarter of them is thinner), cells are smaller, for up to about `MOST_FACES`: a floor
+    slips between the nodes of a lattice much coarser than it is thick, and has holes.
     """
     factors = model.scale_tril.detach()[model.weights > 0].double()
     if len(factors) == 0:
@@ -47,7 +46,8 @@ def view_resolution(model: Any) -> float:
     stds = torch.linalg.svdvals(factors) / model.covariance_scale**0.5
     area = 8 * float((stds[:, 0] * stds[:, 1]).sum())
     wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MOST_FACES))
-    return max(0.02, fine, min(wide, SHEET_CELLS * surface_step(model)))
+    thin = float(stds[:, -1].quantile(0.25)) * model.covariance_scale**0.5
+    return max(0.02, fine, min(wide, SHEET_CELLS * thin))
 
 
 def slice_picture(

@@ -17,7 +17,7 @@ VIEWS: dict[str, dict[str, Any]] = {  # 7-Scenes is in the frame of its first ca
     "riegl_vz400i_rtls": {"elevation": 25},
     "balm_realworld": {"elevation": 50, "cut_above": 6.0},
 }
-RESOLUTION = {"sevenscenes_rgbd": 0.03, "riegl_vz400i_rtls": 0.06, "balm_realworld": 0.08}  # [m]
+RESOLUTION = {"sevenscenes_rgbd": 0.03, "riegl_vz400i_rtls": 0.06, "balm_realworld": 0.15}  # [m]
 
 
 def main() -> None:
