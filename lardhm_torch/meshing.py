@@ -63,8 +63,9 @@ def extract_mesh(
 
     Args:
         model: a 3-D map.
-        resolution: edge of a lattice cell [m].
-        threshold: probability of occupancy on the surface, between 0 and 1.
+        resolution: edge of a lattice cell [m]. Through cells much larger than a surface is thick
+            (standard deviation of its clusters across it), it slips and is left with holes.
+        threshold: occupied is what exceeds this probability, between 0 and 1.
         bounds: lower and upper corner of the part to mesh, world frame [m]; left out: all of it.
         surface: "peak" or "crossing", as for `rays.raycast`.
         color: of the vertices: "height", "cluster" (one color for each nearest supporting

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 SLICE_PIXELS = 512  # along the longer edge
 MESH_FACES = 200_000  # about; the resolution is chosen for it
+MOST_FACES = 1_000_000  # about; where surfaces are so thin that they need finer cells
+SHEET_CELLS = 1.5  # thicknesses: through larger cells thin sheets slip
 SHOWN_FACES = 60_000  # of a surface on the page
 KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light that is painted on
 
@@ -34,14 +36,18 @@ def core_box(model: Any, share: float = 0.02, margin: float = 0.5) -> tuple[Tens
 def view_resolution(model: Any) -> float:
     """Edge of a cell [m] at which the surface has about `MESH_FACES` faces.
 
-    The clusters lie on the surface like tiles of two standard deviations to each side.
+    The clusters lie on the surface like tiles of two standard deviations to each side. Where they
+    are thin (a quarter of them is thinner), cells are smaller, for up to about `MOST_FACES`: a floor
+    slips between the nodes of a lattice much coarser than it is thick, and has holes.
     """
     factors = model.scale_tril.detach()[model.weights > 0].double()
     if len(factors) == 0:
         return 0.1
     stds = torch.linalg.svdvals(factors) / model.covariance_scale**0.5
     area = 8 * float((stds[:, 0] * stds[:, 1]).sum())
-    return max(0.02, (4 * area / MESH_FACES) ** 0.5)
+    wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MOST_FACES))
+    thin = float(stds[:, -1].quantile(0.25)) * model.covariance_scale**0.5
+    return max(0.02, fine, min(wide, SHEET_CELLS * thin))
 
 
 def slice_picture(

@@ -13,7 +13,14 @@ import numpy as np
 from torch import Tensor
 
 from lardhm_torch.scans import Scans
-from lardhm_torch.scene import ellipsoids, fewer_faces, painted_glb, scan_points, slice_picture
+from lardhm_torch.scene import (
+    KEY_LIGHT,
+    ellipsoids,
+    fewer_faces,
+    painted_glb,
+    scan_points,
+    slice_picture,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -27,7 +34,17 @@ class Stage:
     def __init__(self, server: Any, offset: np.ndarray) -> None:
         self.server, self.offset = server, offset
         self._controls: dict[str, Any] = {}
-        server.scene.configure_default_lights(True, cast_shadow=False)
+        self._light()
+
+    def _light(self) -> None:
+        """One lamp where the painted light comes from: viser's own lights bleach the clusters."""
+        scene = self.server.scene
+        scene.configure_default_lights(False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/lights/everywhere", intensity=0.8)
+        scene.add_light_directional(
+            "/lights/key", intensity=0.8, position=tuple(KEY_LIGHT), cast_shadow=False
+        )
 
     def follow(self, name: str, control: Any) -> None:
         """Show what has this name, now or later, while the checkbox is set."""

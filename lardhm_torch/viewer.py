@@ -22,6 +22,10 @@ from lardhm_torch.scene import core_box, knows_variance, variance_colors, view_r
 from lardhm_torch.stage import Stage
 
 EXPORT_SUFFIXES = (".html", ".viser")
+THRESHOLD_HINT = (
+    "The surface stays where the hits lie. A higher threshold leaves out what the map is less sure of, "
+    "and shows the backs of what it is sure of."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +34,7 @@ class ViewConfig:
 
     host: str = "127.0.0.1"  # 0.0.0.0: other machines may look, too
     port: int = 8080  # the next free one, if it is taken
-    resolution: float | None = None  # [m] of the surface; None: for about 200,000 faces
+    resolution: float | None = None  # [m] of the surface; None: by `scene.view_resolution`
     max_points: int = 100_000  # of the scans; of more, one for each small cube
     max_clusters: int = 10_000  # ellipsoids; those with the largest weights of more
 
@@ -131,7 +135,7 @@ class MapViewer:
         self._status = gui.add_markdown("starting ...")
         with gui.add_folder("Surface"):
             self._show_mesh = gui.add_checkbox("show surface", True)
-            self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5)
+            self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5, hint=THRESHOLD_HINT)
             known = knows_variance(self._model)
             colors = [color for color in COLORS if known or color != "variance"]
             self._color = gui.add_dropdown("color", colors, initial_value="height")

@@ -13,7 +13,7 @@ from lardhm_torch.viewer import MapViewer
 
 
 def main(scans_path: str, picture: Path) -> None:
-    """Show the surface, the slice and the sensors."""
+    """Show the surface, the points and the sensors."""
     scans = load_scans(scans_path)
     samples = sample_rays(scans)
     viewer = MapViewer(LardHilbertMap().fit(samples.points, samples.labels), scans)
@@ -22,8 +22,6 @@ def main(scans_path: str, picture: Path) -> None:
         page.set_default_timeout(600_000)
         page.goto(viewer.url)
         page.get_by_text("surface of").wait_for()
-        for label in ("show points", "show slice"):
-            page.get_by_label(label).click()
         if page.locator(".mantine-Notification-closeButton").count():
             page.locator(".mantine-Notification-closeButton").first.click()
         page.wait_for_timeout(15_000)

@@ -1,6 +1,7 @@
 import importlib.util
 import io
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -199,6 +200,21 @@ def test_the_page_shows_no_more_than_its_budgets_and_the_mesh_keeps_its_faces(sc
     assert len(everywhere) == len(scans.hits)
     gaps = cKDTree(points).query(everywhere)[0]
     assert gaps.max() < 0.5  # evenly thinned: none of the room is left out
+
+
+def flat_map(thickness):
+    """Wide flat clusters, as thick as that (standard deviation) [m]."""
+    factor = torch.diag(torch.tensor([20.0, 20.0, thickness]))
+    return SimpleNamespace(
+        scale_tril=factor.expand(10, 3, 3), weights=torch.ones(10), covariance_scale=4.0
+    )
+
+
+def test_cells_are_small_where_surfaces_are_thin_but_not_too_many():
+    thick, thin, thinner = (scene.view_resolution(flat_map(t)) for t in (1.0, 0.18, 0.001))
+    assert thin == pytest.approx(scene.SHEET_CELLS * 0.18, rel=0.03)
+    assert thick > thin > thinner
+    assert thick / thinner == pytest.approx((scene.MOST_FACES / scene.MESH_FACES) ** 0.5)
 
 
 def test_painted_light_is_brighter_on_what_faces_it():

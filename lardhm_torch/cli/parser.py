@@ -98,7 +98,7 @@ def _map_verbs(verb: Any) -> None:
     _scans(sub, nargs="*")
     sub.add_argument("--host", default="127.0.0.1", help="0.0.0.0: for other machines, too")
     sub.add_argument("--port", type=int, default=8080, help="of the page (8080 or the next free)")
-    sub.add_argument("--resolution", type=float, help="of the surface [m] (about 200,000 faces)")
+    sub.add_argument("--resolution", type=float, help="of the surface [m] (from the map)")
     sub.add_argument("--export", metavar="FILE", help="write the scene to .html or .viser and end")
 
     sub = verb(asking.render)
@@ -186,7 +186,12 @@ def _seed(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_surface(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--threshold", type=float, default=0.5, help="probability (0.5)")
+    sub.add_argument(
+        "--threshold",
+        type=float,
+        default=0.5,
+        help="of the probability: what exceeds it is occupied (0.5)",
+    )
     sub.add_argument(
         "--surface",
         choices=("peak", "crossing"),
