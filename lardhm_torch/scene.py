@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SLICE_PIXELS = 512  # along the longer edge
 MESH_FACES = 200_000  # about; the resolution is chosen for it
-MOST_FACES = 1_000_000  # about; where surfaces are so thin that they need finer cells
+MOST_FACES = 600_000  # about; where surfaces are so thin that they need finer cells
 SHEET_CELLS = 1.5  # thicknesses: through larger cells thin sheets slip
 SHOWN_FACES = 60_000  # of a surface on the page
 KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light that is painted on
