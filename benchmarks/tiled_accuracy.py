@@ -73,6 +73,12 @@ def accuracies(scores: Scores) -> list[float]:
     return [scores[kind]["balanced_accuracy"] for kind in ("unif", "near")]
 
 
+def changes(result: dict[str, Scores | int]) -> list[float]:
+    """What tiles gain of both accuracies."""
+    pairs = zip(accuracies(result["one map"]), accuracies(result["tiles"]), strict=True)
+    return [tiles - single for single, tiles in pairs]
+
+
 def format_pair(values: list[float], style: str = ".4f") -> str:
     """Figures below 1 of the two kinds, without their zeros before the point."""
     return " / ".join(format(value, style).replace("0.", ".") for value in values)
@@ -82,13 +88,12 @@ def format_row(row: Row, result: dict[str, Scores | int]) -> str:
     """A line of the table, in Markdown."""
     rays = "all" if row.rays is None else f"{row.rays:,}"
     halo = f", halo {row.halo:g} m" if row.halo else ""
-    single, tiles = (accuracies(result[name]) for name in ("one map", "tiles"))
     cells = [
         f"`{row.name}`, {rays} rays, seed {row.seed}{halo}",
         f"{row.edge:g} m, {result['number of tiles']}",
-        format_pair(single),
-        format_pair(tiles),
-        format_pair([b - a for a, b in zip(single, tiles, strict=True)], "+.4f"),
+        format_pair(accuracies(result["one map"])),
+        format_pair(accuracies(result["tiles"])),
+        format_pair(changes(result), "+.4f"),
         f"{result['clusters of one map']:,} / {result['clusters of tiles']:,}",
     ]
     return f"| {' | '.join(cells)} |"
@@ -102,16 +107,16 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = [ROWS[number] for number in arguments.rows]
     paths = find_sets(arguments.data, sorted({row.name for row in rows}))
+    scans = {name: load_scans(path) for name, path in paths.items()}
     record = {"conditions": conditions(), "rows": []}
     print(describe(record["conditions"]), end="\n\n")
     print("| rays | edge, tiles | one map | tiles | change | clusters |\n|---|---|---|---|---|---|")
     lost = 0.0
     for row in rows:
-        result = run_row(row, load_scans(paths[row.name]))
+        result = run_row(row, scans[row.name])
         print(format_row(row, result), flush=True)
         record["rows"].append({**row._asdict(), **result})
-        pairs = zip(accuracies(result["one map"]), accuracies(result["tiles"]), strict=True)
-        lost = max(lost, *(a - b for a, b in pairs))
+        lost = max(lost, *(-change for change in changes(result)))
     print(f"\ntiles lose at most {lost:.4f}")
     write_json(arguments.json, record)
     sys.exit(lost > MOST_LOST)

@@ -43,10 +43,10 @@ def view_resolution(model: Any) -> float:
     factors = model.scale_tril.detach()[model.weights > 0].double()
     if len(factors) == 0:
         return 0.1
-    stds = torch.linalg.svdvals(factors) / model.covariance_scale**0.5
-    area = 8 * float((stds[:, 0] * stds[:, 1]).sum())
+    axes = torch.linalg.svdvals(factors)  # of the kernels, the longest first
+    area = 8 / model.covariance_scale * float((axes[:, 0] * axes[:, 1]).sum())
     wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MOST_FACES))
-    thin = float(stds[:, -1].quantile(0.25)) * model.covariance_scale**0.5
+    thin = float(axes[:, -1].quantile(0.25))
     return max(0.02, fine, min(wide, SHEET_CELLS * thin))
 
 

@@ -111,6 +111,7 @@ def test_depth_images_make_a_map(data, tmp_path):
     options = ["--camera", "585,585,320,240", "--pixel-step", 20]
     run("fit", frames, *options, "--clusters", 100, "-o", tmp_path / "map.pt")
     run("info", tmp_path / "map.pt")
+    assert 0 < len(LardHilbertMap.load(tmp_path / "map.pt")) <= 100
 
 
 def test_scans_of_the_sensors_frame_are_moved_by_a_pose_file(tmp_path):

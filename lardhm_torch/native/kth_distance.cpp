@@ -81,6 +81,7 @@ struct SmallestOfAny {
 template <class I, int K>
 struct SmallestOfEights {
   static constexpr int kAtOnce = 8, kKept = K > 8 ? 16 : 8;
+  static_assert(K <= kKept);
   I value[kKept];
 
   explicit SmallestOfEights(int) {
@@ -98,14 +99,9 @@ struct SmallestOfEights {
 };
 
 template <class I, int K>
-struct KeptFor {
-  using Type = std::conditional_t<(K >= 8), SmallestOfEights<I, K>, Smallest<I, K>>;
-};
-
-template <class I>
-struct KeptFor<I, 0> {
-  using Type = SmallestOfAny<I>;
-};
+using KeptFor =
+    std::conditional_t<K == 0, SmallestOfAny<I>,
+                       std::conditional_t<(K < 8), Smallest<I, K>, SmallestOfEights<I, K>>>;
 
 // A product that is rounded before it is added to anything.
 template <class V>
@@ -128,7 +124,7 @@ typename Simd<T>::I kth_distance(const Packet<T, D>& packet, const T* positions,
                                  typename Simd<T>::I* distance) {
   using V = typename Simd<T>::V;
   using I = typename Simd<T>::I;
-  using Kept = typename KeptFor<I, K>::Type;
+  using Kept = KeptFor<I, K>;
   Kept smallest(k);
   const auto squared_distance = [&](int64_t i) {
     const T* center = positions + int64_t(list[i]) * Layout<D>::position;
