@@ -16,6 +16,8 @@ from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.incremental import Task, UpdateConfig, updated
 from lardhm_torch.sampling import check_samples
 
+FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
+
 
 class LardHilbertMap(nn.Module):
     """Continuous occupancy: a weighted sum of local kernel features gives the log-odds.
@@ -511,7 +513,15 @@ def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
     Whole meters are exact in float32 too, so float32 points lose nothing.
     """
     working = torch.promote_types(torch.promote_types(points.dtype, dtype), torch.float32)
-    return (points.to(working) - origin.to(working)).to(dtype)
+    shift = origin.to(working)
+    plain = working == dtype or points.ndim != 2 or points.requires_grad
+    if plain or torch.compiler.is_compiling():
+        return (points.to(working) - shift).to(dtype)
+    local = points.new_empty(points.shape, dtype=dtype)  # in small steps: nothing large in between
+    shift = shift.expand(min(FRAME_CHUNK, len(points)), -1).contiguous()
+    for to, part in zip(local.split(FRAME_CHUNK), points.split(FRAME_CHUNK), strict=True):
+        to.copy_(part - shift[: len(part)])
+    return local
 
 
 def _check_num_clusters(num_clusters: int | None) -> None:

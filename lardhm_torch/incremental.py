@@ -21,9 +21,6 @@ from lardhm_torch.clustering import (
     along_curve,
     cluster_classes,
     cluster_points,
-    clusters_about,
-    factor_covariances,
-    points_where,
     scan_clusters,
     split_classes,
     split_clusters,
@@ -32,7 +29,7 @@ from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig
 from lardhm_torch.map_state import MapState
 from lardhm_torch.merging import append_clusters, merge_clusters, pool_into, take_clusters, whitened
-from lardhm_torch.native.update import explain, reaching
+from lardhm_torch.native.update import explain, reaching, unexplained
 from lardhm_torch.replay import (
     around,
     contradicted,
@@ -202,10 +199,9 @@ def absorb(
     pooled = (look.found.counts > 0).nonzero().squeeze(1)
     part = pool_into(part, own[pooled], take_clusters(look.found, pooled), floor)
     met = torch.cat([own[pooled], own[look.outgrown]])
-    rest = points_where(points, look.unexplained)
-    if len(rest) < MIN_COUNT:
+    if len(look.rest) < MIN_COUNT:
         return part, met
-    (rest,) = along_curve(rest)
+    (rest,) = along_curve(look.rest)
     share = -(-num_clusters * len(rest) // len(points))
     new = cluster_points(rest, share, task.rng)
     new, where = _settle(known, new, look, task)
@@ -217,10 +213,11 @@ class _Look(NamedTuple):
     """What known clusters make of new points.
 
     ``found`` are the moments of the points that join each cluster; ``outgrown`` are the clusters
-    that are too coarse for the scan, and ``covered`` those among them that the scan saw whole.
+    that are too coarse for the scan, and ``covered`` those among them that the scan saw whole;
+    ``rest`` are the points of the outgrown clusters, and those that no cluster explains.
     """
 
-    unexplained: Tensor
+    rest: Tensor
     found: Clusters
     outgrown: Tensor
     covered: Tensor
@@ -229,17 +226,13 @@ class _Look(NamedTuple):
 def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Look:
     config, clusters = task.config, known.clusters
     if len(known) == 0:
-        everything = torch.ones(len(points), dtype=torch.bool, device=points.device)
-        return _Look(everything, clusters, known.is_occupied, known.is_occupied)
-    factors = factor_covariances(clusters.covariances, task.kernel.min_lengthscale)
-    near = (config.radius, config.reach)
-    owners, *moments = explain(points, clusters.means, factors, *near)
-    found = clusters_about(clusters.means, *moments)
+        return _Look(points, clusters, known.is_occupied, known.is_occupied)
+    rule = (task.kernel.min_lengthscale, config.radius, config.reach)
+    owners, found = explain(points, clusters, *rule)
     outgrown = found.counts > config.refine * clusters.counts.clamp(min=2 * usual_count)
     covered = outgrown & (_spread(found) > COVERED * _spread(clusters))
     found = Clusters(found.counts * ~outgrown, found.means, found.scatters)
-    unexplained = torch.cat([outgrown, outgrown.new_ones(1)]).index_select(0, owners)
-    return _Look(unexplained, found, outgrown, covered)
+    return _Look(unexplained(points, owners, ~outgrown), found, outgrown, covered)
 
 
 def _spread(clusters: Clusters) -> Tensor:

@@ -6,17 +6,18 @@ held to be true there; points drawn from the moments, labelled by the map, stand
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import MIN_COUNT, factor_covariances, spread_rows, z_order
+from lardhm_torch.clustering import MIN_COUNT, along_curve, factor_covariances, spread_rows
 from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig, class_factors, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
-from lardhm_torch.native.update import explain, ordered_features
+from lardhm_torch.native.update import explain, ordered_features, possibly_inside
 
 INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
 KEPT = 0.25  # of a contradicted cluster's past
@@ -34,6 +35,10 @@ class Evidence:
     labels: Tensor
     is_occupied: Tensor
     strength: Tensor
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """The columns, in order."""
+        return (getattr(self, field.name) for field in fields(self))
 
     def __len__(self) -> int:
         """Number of points N."""
@@ -101,8 +106,7 @@ def hit_clusters(known: MapState, hits: Tensor, floor: float) -> Tensor:
 
 def _points_inside(known: MapState, points: Tensor, floor: float) -> Tensor:
     """(M,) how many (N, D) points lie in each of M clusters, each point in its nearest at most."""
-    factors = factor_covariances(known.clusters.covariances, floor)
-    return explain(points, known.means, factors, INSIDE, INSIDE)[1]
+    return explain(points, known.clusters, floor, INSIDE, INSIDE)[1].counts
 
 
 def contradicted(
@@ -124,8 +128,10 @@ def contradicted(
     occupied = known.is_occupied.nonzero().squeeze(1)
     if len(occupied) == 0 or num_hits == 0 or len(passed) == 0:
         return worth
-    passes = _points_inside(known.rows(occupied), passed, floor)
-    passes *= num_hits / len(passed)  # in units of hits, as if both classes had one total
+    share = num_hits / len(passed)  # in units of hits, as if both classes had one total
+    unseen = known.rows(known.is_occupied & ~hit).clusters
+    passed = possibly_inside(passed, unseen, floor, INSIDE)
+    passes = share * _points_inside(known.rows(occupied), passed, floor).to(worth)
     denied = (passes > 0) & ~hit[occupied]
     return worth.index_copy_(0, occupied, passes.where(denied, torch.inf))
 
@@ -182,8 +188,7 @@ def around(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) 
 
 def join_evidence(parts: list[Evidence]) -> Evidence:
     """All points of several, in order."""
-    names = [field.name for field in fields(Evidence)]
-    return Evidence(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+    return Evidence(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def learn(
@@ -208,13 +213,11 @@ def learn(
         rng: random state.
     """
     batch_size = config.rows_a_batch(len(evidence))
-    (order,) = deal_samples((z_order(evidence.points),), batch_size, rng)
+    points, *columns = along_curve(*evidence)
+    rows = torch.arange(len(points), device=points.device)
+    order, labels, is_occupied, strength = deal_samples((rows, *columns), batch_size, rng)
     indices, values = ordered_features(
-        evidence.points, order, state.centers, state.raw_scale_tril, kernel, index
-    )
-    labels, is_occupied, strength = (
-        column.index_select(0, order)
-        for column in (evidence.labels, evidence.is_occupied, evidence.strength)
+        points, order, state.centers, state.raw_scale_tril, kernel, index
     )
     total, occupied = strength.sum(), (strength * is_occupied).sum()
     counts = strength * (len(evidence) / total)

@@ -5,11 +5,17 @@ import torch
 from native_maps import dims, dtypes, kernel, make_map, make_points, true_distances
 
 from lardhm_torch import native
-from lardhm_torch.clustering import cluster_points, factor_covariances
+from lardhm_torch.clustering import Clusters, along_curve, cluster_points, factor_covariances
 from lardhm_torch.features import kernel_factors, raw_factors
 from lardhm_torch.map_state import MapState
 from lardhm_torch.merging import pool_into
-from lardhm_torch.native.update import explain, ordered_features, reaching
+from lardhm_torch.native.update import (
+    explain,
+    ordered_features,
+    possibly_inside,
+    reaching,
+    unexplained,
+)
 
 both_paths = pytest.mark.parametrize("native_path", [True, False])
 
@@ -32,9 +38,13 @@ def test_points_near_their_center_have_an_owner_and_nearer_ones_count(
 ):
     path(native_path)
     centers, raw, _ = make_map(40, dim, dtype)
-    factors = raw.tril(-1) + torch.diag_embed(raw.diagonal(dim1=1, dim2=2).exp())
+    lower = raw.tril(-1) + torch.diag_embed(raw.diagonal(dim1=1, dim2=2).exp())
+    centers[7] = 100  # nobody joins it
+    sizes = torch.arange(5, 45)
+    clusters = Clusters(sizes, centers, lower @ lower.mT * (sizes - 1)[:, None, None])
+    factors = factor_covariances(clusters.covariances, 0.01)
     points = make_points(4000, dim, dtype)
-    owners, counts, sums, scatters = explain(points, centers, factors, 1.5, 3.0)
+    owners, found = explain(points, clusters, 0.01, 1.5, 3.0)
     nearest = true_distances(points, centers).argmin(dim=1)
     offsets = (points - centers[nearest]).double()
     solved = torch.linalg.solve_triangular(
@@ -44,13 +54,60 @@ def test_points_near_their_center_have_an_owner_and_nearer_ones_count(
     assert 100 < (distance > 3).sum() < 3900
     assert torch.equal(owners.long(), torch.where(distance <= 3, nearest, 40))
     joins = distance <= 1.5
-    zeros = torch.zeros(40, dim, dim, dtype=torch.float64)
-    products = offsets[joins, :, None] * offsets[joins, None]
-    assert torch.equal(counts.long(), nearest[joins].bincount(minlength=40))
-    total = zeros[:, 0].clone().index_add_(0, nearest[joins], offsets[joins])
-    torch.testing.assert_close(sums, total.to(dtype), rtol=1e-5, atol=1e-5)
-    total = zeros.index_add_(0, nearest[joins], products)
-    torch.testing.assert_close(scatters, total.to(dtype), rtol=1e-5, atol=1e-5)
+    assert torch.equal(found.counts, nearest[joins].bincount(minlength=40))
+    assert found.counts[7] == 0
+    for row in range(40):
+        own = points[joins & (nearest == row)].double()
+        mean = own.mean(dim=0) if len(own) else centers[row].double()
+        torch.testing.assert_close(found.means[row], mean.to(dtype), rtol=1e-5, atol=1e-5)
+        scatter = (own - mean).T @ (own - mean)
+        torch.testing.assert_close(found.scatters[row], scatter.to(dtype), rtol=1e-5, atol=1e-5)
+
+
+@dims
+@dtypes
+@both_paths
+@pytest.mark.parametrize("count", [0, 1, 40_000])
+def test_points_that_no_kept_cluster_owns_stay_in_order(dtype, dim, native_path, count, path):
+    path(native_path)
+    points = torch.arange(float(count * dim), dtype=dtype).reshape(count, dim)
+    rng = torch.Generator().manual_seed(0)
+    owners = torch.randint(11, (count,), generator=rng, dtype=torch.int32)  # 10 is nobody
+    kept = torch.tensor([True, False] * 5)
+    rest = unexplained(points, owners, kept)
+    assert torch.equal(rest, points[(owners % 2 == 1) | (owners == 10)])
+
+
+@dims
+@dtypes
+@both_paths
+def test_all_points_inside_a_cluster_are_possibly_inside(dtype, dim, native_path, path):
+    path(native_path)
+    rng = torch.Generator().manual_seed(0)
+    sources = torch.rand(400, dim, generator=rng, dtype=dtype) * torch.arange(1, dim + 1)
+    clusters = cluster_points(along_curve(sources)[0], 20, rng)
+    points = 8 * torch.rand(20_000, dim, generator=rng, dtype=dtype) - 4
+    inside = explain(points, clusters, 0.01, 3.0, 3.0)[0] < len(clusters)
+    possible = possibly_inside(points, clusters, 0.01, 3.0)
+    assert torch.equal(points[inside], possible[torch.isin(possible[:, 0], points[inside, 0])])
+    assert 50 < inside.sum() <= len(possible)
+    if native_path:
+        assert len(possible) < 8 * inside.sum()
+    moments = (clusters.counts, clusters.means, clusters.scatters)
+    assert len(possibly_inside(points, Clusters(*(t[:0] for t in moments)), 0.01, 3.0)) == 0
+    assert len(possibly_inside(points[:0], clusters, 0.01, 3.0)) == 0
+
+
+def test_owners_of_other_points_are_refused(ops):
+    points, kept = torch.zeros(5, 3), torch.ones(2, dtype=torch.bool)
+    with pytest.raises(RuntimeError, match="one a point"):
+        unexplained(points, torch.zeros(4, dtype=torch.int32), kept)
+
+
+def test_a_covariance_that_is_none_is_refused(ops):
+    clusters = Clusters(torch.tensor([9]), torch.zeros(1, 3), -torch.eye(3)[None])
+    with pytest.raises(RuntimeError, match="not positive definite"):
+        explain(torch.zeros(5, 3), clusters, 0.01, 1.0, 2.0)
 
 
 @dims
@@ -124,10 +181,13 @@ def test_opcheck_accepts_the_operators_of_an_update(ops):
     centers, raw, _ = make_map(12, 3, torch.float64)
     points, order = make_points(40, 3, torch.float64), torch.arange(39, -1, -1)
     index = ops.build_index(centers, 5)
-    torch.library.opcheck(ops.explain.default, (points, centers, raw, 1.0, 2.0))
+    counts, scatters = torch.full((12,), 9), torch.eye(3).double().repeat(12, 1, 1)
+    moments = (counts, centers, scatters)
+    torch.library.opcheck(ops.explain.default, (points, *moments, 0.01, 1.0, 2.0))
+    owners, kept = torch.arange(40, dtype=torch.int32) % 13, counts < 0
+    torch.library.opcheck(ops.possibly_inside.default, (points, *moments, 0.01, 1.0))
+    torch.library.opcheck(ops.unexplained.default, (points, owners, kept))
     torch.library.opcheck(ops.reaching.default, (centers, raw, points, 2.0, *kernel(5)[1:]))
     given = (points, order, centers, raw, index, *kernel(5))
     torch.library.opcheck(ops.ordered_features.default, given)
-    counts, scatters = torch.full((12,), 9), torch.eye(3).double().repeat(12, 1, 1)
-    moments = (counts, centers, scatters)
     torch.library.opcheck(ops.pool.default, (*moments, raw, *moments, 0.01))

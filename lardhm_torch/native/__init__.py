@@ -251,11 +251,14 @@ def _register() -> None:
         return tuple(torch.empty_like(weights) for _ in range(3))
 
     @library.register_fake("lardhm::explain")
-    def _(points: Tensor, centers: Tensor, *_: Any) -> tuple[Tensor, ...]:
-        count, dim = centers.shape
+    def _(points: Tensor, *clusters_and_rule: Any) -> tuple[Tensor, ...]:
         owners = points.new_empty(points.shape[0], dtype=torch.int32)
-        sizes = [(count, *[dim] * power) for power in range(3)]
-        return owners, *(centers.new_empty(size) for size in sizes)
+        return owners, *(torch.empty_like(moments) for moments in clusters_and_rule[:3])
+
+    @library.register_fake("lardhm::possibly_inside")
+    @library.register_fake("lardhm::unexplained")
+    def _(points: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(library.get_ctx().new_dynamic_size(), points.shape[1])
 
     @library.register_fake("lardhm::reaching")
     def _(centers: Tensor, *_: Any) -> Tensor:

@@ -7,29 +7,10 @@
 #include <cstring>
 #include <tuple>
 
-#include "tensors.h"
+#include "clusters.h"
 
 namespace lardhm {
 namespace {
-
-// Lower triangles, D rows of D; what is above the diagonal is never read.
-template <int D>
-using Matrix = double[D][D];
-
-// As `clustering.factor_covariances`: of scatter / (count - 1) with a ridge.
-template <int D>
-void factor(const double* scatter, double count, double floor, Matrix<D> lower) {
-  const double share = 1 / std::max(count - 1, 1.0);
-  double largest = scatter[0] * share;
-  for (int d = 1; d < D; ++d) largest = std::max(largest, scatter[d * D + d] * share);
-  const double ridge = floor * floor + 1e-6 * largest;
-  for (int i = 0; i < D; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double sum = scatter[i * D + j] * share + (i == j ? ridge : 0);
-      for (int m = 0; m < j; ++m) sum -= lower[i][m] * lower[j][m];
-      lower[i][j] = i == j ? std::sqrt(sum) : sum / lower[j][j];
-    }
-}
 
 // inv(before) raw-factor, in place of the factor: forward substitution, column by column.
 template <int D>
@@ -65,11 +46,9 @@ struct Pooled {
 
   // False where a covariance is not positive definite.
   bool move(const T* scatter_before, int64_t known, double floor, const T* raw, T* to) const {
-    double before_scatter[D * D];
-    for (int i = 0; i < D * D; ++i) before_scatter[i] = double(scatter_before[i]);
     Matrix<D> before, after, tuned;
-    factor<D>(before_scatter, double(known), floor, before);
-    factor<D>(scatter, count, floor, after);
+    const bool definite = factor<D>(scatter_before, double(known), floor, before) &&
+                          factor<D>(scatter, count, floor, after);
     for (int i = 0; i < D; ++i)
       for (int j = 0; j <= i; ++j)
         tuned[i][j] = i == j ? std::exp(double(raw[i * D + i])) : double(raw[i * D + j]);
@@ -80,24 +59,11 @@ struct Pooled {
         for (int m = j; m <= i; ++m) sum += after[i][m] * tuned[m][j];
         to[i * D + j] = T(i == j ? std::log(sum) : sum);
       }
-    double product = 1;
-    for (int d = 0; d < D; ++d) product *= after[d][d] * before[d][d];
-    return product > 0;
+    return definite;
   }
 };
 
 using Clusters = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
-
-void check_moments(const Tensor& counts, const Tensor& means, const Tensor& scatters,
-                   const Tensor& like) {
-  const int64_t size = like.size(0), dim = like.size(1);
-  check(counts.scalar_type() == ScalarType::Long && counts.numel() == size &&
-            means.dim() == 2 && means.size(0) == size && means.size(1) == dim &&
-            scatters.numel() == size * dim * dim &&
-            means.scalar_type() == like.scalar_type() &&
-            scatters.scalar_type() == like.scalar_type(),
-        "counts (M,) int64, means (M, D) and scatters (M, D, D) must be of one size");
-}
 
 // (counts, means, scatters, how far the means moved, raw factors) of the clusters of both.
 Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tensor& given_scatters,

@@ -1,6 +1,7 @@
 // Scans into maps: points to the clusters that explain them, and which clusters a scan can touch.
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -8,10 +9,10 @@
 #include <tuple>
 #include <vector>
 
+#include "clusters.h"
 #include "kernel.h"
 #include "moments.h"
 #include "sorting.h"
-#include "tensors.h"
 
 namespace lardhm {
 namespace {
@@ -48,37 +49,82 @@ struct ExplainVisitor final : Visitor<T, D> {
       for (int d = 1; d < D; ++d) squared += z[d] * z[d];
       T distance[Simd<T>::W];
       std::memcpy(distance, &squared, sizeof(squared));
+      double own[kMoments<D>] = {};
       for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
         owners[packet.row(lane)] = distance[lane] <= explains ? order[rank] : none;
         if (!(distance[lane] <= joins)) continue;
         T offset[D];
         for (int d = 0; d < D; ++d) offset[d] = at[d][lane] - center[d];
-        add_moments<T, D>(offset, true, sums + rank * kMoments<D>);
+        add_moments<T, D>(offset, true, own);
       }
+      for (int i = 0; i < kMoments<D>; ++i) sums[rank * kMoments<D> + i] += own[i];
     }
   }
 };
 
+// Raw factors of clusters from their moments.
+template <class T, int D>
+void write_raw_factors(const Tensor& counts, const Tensor& scatters, double floor, T* raw) {
+  constexpr int64_t kGrain = 512;
+  const int64_t size = counts.numel();
+  std::atomic<bool> definite{true};
+  run_tasks((size + kGrain - 1) / kGrain, [&](int64_t task) {
+    for (int64_t m = task * kGrain; m < std::min(size, (task + 1) * kGrain); ++m) {
+      Matrix<D> lower;
+      if (!factor<D>(in<T>(scatters) + m * D * D, double(in<int64_t>(counts)[m]), floor, lower))
+        definite = false;
+      for (int i = 0; i < D; ++i)
+        for (int j = 0; j < D; ++j)
+          raw[(m * D + i) * D + j] = T(i == j ? std::log(lower[i][i]) : i > j ? lower[i][j] : 0);
+    }
+  });
+  check(definite, "a covariance is not positive definite");
+}
+
+// Of the points that belong to each center: how many, their mean and their scatter about it.
+template <class T, int D>
+void write_found(const MomentParts<D>& moments, const int32_t* order, const T* centers,
+                 int64_t* counts, T* means, T* scatters) {
+  for (int64_t rank = 0; rank < moments.count; ++rank) {
+    double sum[kMoments<D>], shift[D];
+    moments.total(rank, kMoments<D>, sum);
+    const int64_t row = order[rank];
+    counts[row] = int64_t(sum[0]);
+    for (int d = 0; d < D; ++d) {
+      shift[d] = sum[1 + d] / std::max(sum[0], 1.0);
+      means[row * D + d] = T(double(centers[row * D + d]) + shift[d]);
+    }
+    const double* product = sum + 1 + D;
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j, ++product)
+        scatters[(row * D + i) * D + j] = scatters[(row * D + j) * D + i] =
+            T(*product - sum[1 + i] * shift[j]);
+  }
+}
+
 using Explained = std::tuple<Tensor, Tensor, Tensor, Tensor>;
 
-Explained explain(const Tensor& given_points, const Tensor& centers, const Tensor& raw,
-                  double radius, double reach) {
-  const Tensor points = tidy(given_points);
-  check_rows("points", points, centers);
-  const int64_t count = centers.size(0), dim_size = centers.size(1), n = points.size(0);
-  check(count > 0, "centers must hold at least one row");
-  const Tensor weights = torch::stable::new_zeros(centers, {count});
-  const Tensor no_index = torch::stable::new_empty(centers, {0}, ScalarType::Byte);
-  const MapTensors map(centers, raw, weights, no_index, 1.0, 0.0);
+Explained explain(const Tensor& given_points, const Tensor& given_counts, const Tensor& given_means,
+                  const Tensor& given_scatters, double floor, double radius, double reach) {
+  const Tensor points = tidy(given_points), counts = tidy(given_counts);
+  const Tensor means = tidy(given_means), scatters = tidy(given_scatters);
+  check_rows("points", points, means);
+  check_moments(counts, means, scatters, means);
+  const int64_t count = means.size(0), n = points.size(0);
+  check(count > 0, "there must be at least one cluster");
+  const Tensor weights = torch::stable::new_zeros(means, {count});
+  const Tensor no_index = torch::stable::new_empty(means, {0}, ScalarType::Byte);
+  const Tensor raw = torch::stable::new_empty(scatters, scatters.sizes());
   const Explained result{torch::stable::new_empty(points, {n}, ScalarType::Int),
-                         torch::stable::new_zeros(points, {count}),
-                         torch::stable::new_zeros(points, {count, dim_size}),
-                         torch::stable::new_zeros(points, {count, dim_size, dim_size})};
-  if (n == 0) return result;
-  dispatch(centers, [&](auto type, auto dim) {
+                         torch::stable::new_empty(counts, counts.sizes()),
+                         torch::stable::new_empty(means, means.sizes()),
+                         torch::stable::new_empty(scatters, scatters.sizes())};
+  dispatch(means, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
+    write_raw_factors<T, D>(counts, scatters, floor, out<T>(raw));
+    const MapTensors map(means, raw, weights, no_index, 1.0, 0.0);
     with_parameters<T, D>(map, n, [&](Parameters<T, D>& parameters) {
       const int64_t bytes = count * kMoments<D> * sizeof(double);
       MomentParts<D> moments(count, parts_of(n, bytes, parameters));
@@ -86,9 +132,10 @@ Explained explain(const Tensor& given_points, const Tensor& centers, const Tenso
       for (int64_t part = 0; part < moments.parts; ++part)
         visitors.emplace_back(parameters, radius, reach, out<int32_t>(std::get<0>(result)),
                               moments.part(part));
-      visit_parts<T, D>(in<T>(points), n, parameters, 1, each_of<T, D>(visitors));
-      moments.write(parameters.index.order, out<T>(std::get<1>(result)),
-                    out<T>(std::get<2>(result)), out<T>(std::get<3>(result)));
+      if (n) visit_parts<T, D>(in<T>(points), n, parameters, 1, each_of<T, D>(visitors));
+      write_found<T, D>(moments, parameters.index.order, in<T>(means),
+                        out<int64_t>(std::get<1>(result)), out<T>(std::get<2>(result)),
+                        out<T>(std::get<3>(result)));
     });
     return 0;
   });
@@ -153,8 +200,8 @@ Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_po
 
 STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
   m.def(
-      "explain(Tensor points, Tensor centers, Tensor raw_scale_tril, float radius, float reach) "
-      "-> (Tensor, Tensor, Tensor, Tensor)");
+      "explain(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
+      "float radius, float reach) -> (Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
       "float covariance_scale, float min_lengthscale) -> Tensor");

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import features, native
+from lardhm_torch.clustering import Clusters, clusters_about, factor_covariances, points_where
 from lardhm_torch.features import Kernel
 
 
@@ -34,26 +35,29 @@ def reaching(
 
 
 def explain(
-    points: Tensor, centers: Tensor, scale_tril: Tensor, radius: float, reach: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Every point to its nearest center, if that is near enough, and the moments of the nearest.
+    points: Tensor, clusters: Clusters, floor: float, radius: float, reach: float
+) -> tuple[Tensor, Clusters]:
+    """Every point to the cluster with the nearest mean, if it is near enough.
 
     Distances to decide whether it is near enough are in standard deviations of the cluster.
 
     Args:
         points: (N, D) positions [m].
-        centers: (M, D) cluster centers [m], at least one.
-        scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
-        radius: nearer points count in the moments.
+        clusters: M of them, at least one.
+        floor: smallest standard deviation [m], see `clustering.factor_covariances`.
+        radius: nearer points join the cluster.
         reach: nearer points have an owner; not less than ``radius``.
 
     Returns:
-        (N,) int owners, M for a point without one; (M,) counts; (M, D) sums of the offsets from
-        the own center [m]; (M, D, D) sums of their outer products [m^2]. Sums are taken in float64.
+        (N,) int owners, M for a point without one; the moments of the points that join each of the
+        clusters, of none the cluster's own mean and no scatter. Sums are taken in float64.
     """
     if native.supports(points):
-        raw = features.raw_factors(scale_tril)
-        return torch.ops.lardhm.explain(points.detach(), centers, raw, radius, reach)
+        given = (clusters.counts, clusters.means, clusters.scatters)
+        rule = (floor, radius, reach)
+        owners, *moments = torch.ops.lardhm.explain(points.detach(), *given, *rule)
+        return owners, Clusters(*moments)
+    centers, factors = clusters.means, factor_covariances(clusters.covariances, floor)
     count, dim = centers.shape
     owners = torch.full((len(points),), count, device=points.device)
     moments = [centers.new_zeros(count, *[dim] * power, dtype=torch.float64) for power in range(3)]
@@ -61,7 +65,7 @@ def explain(
         chunk = points[rows]
         owner = features.nearest_centers(chunk, centers, 1).squeeze(1)
         offsets = (chunk - centers[owner])[:, :, None]
-        whitened = torch.linalg.solve_triangular(scale_tril[owner], offsets, upper=False)
+        whitened = torch.linalg.solve_triangular(factors[owner], offsets, upper=False)
         squared = whitened.square().sum(dim=(1, 2))
         owners[rows[squared <= reach**2]] = owner[squared <= reach**2]
         joins = squared <= radius**2
@@ -69,8 +73,39 @@ def explain(
         moments[0].index_add_(0, owner, torch.ones_like(offset[:, 0]))
         moments[1].index_add_(0, owner, offset)
         moments[2].index_add_(0, owner, offset[:, :, None] * offset[:, None])
-    counts, sums, scatters = (moment.to(centers.dtype) for moment in moments)
-    return owners, counts, sums, scatters
+    found = clusters_about(centers.double(), *moments)
+    return owners, Clusters(found.counts, found.means.to(centers), found.scatters.to(centers))
+
+
+def possibly_inside(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
+    """(P, D) the points that can lie inside some cluster: all that do, in their order, and others.
+
+    Asking only them where the points lie saves most of the time.
+
+    Args:
+        points: (N, D) positions [m].
+        clusters: M of them.
+        floor: smallest standard deviation [m], see `clustering.factor_covariances`.
+        radius: standard deviations within which a point is inside.
+    """
+    if native.supports(points):
+        moments = (clusters.counts, clusters.means, clusters.scatters)
+        return torch.ops.lardhm.possibly_inside(points.detach(), *moments, floor, radius)
+    return points if len(clusters) else points[:0]
+
+
+def unexplained(points: Tensor, owners: Tensor, kept: Tensor) -> Tensor:
+    """(R, D) the points that no kept cluster owns, in their order.
+
+    Args:
+        points: (N, D) positions [m].
+        owners: (N,) of `explain`.
+        kept: (M,) bool, which clusters keep the points that they own.
+    """
+    if native.supports(points):
+        return torch.ops.lardhm.unexplained(points.detach(), owners, kept)
+    left_out = torch.cat([~kept, kept.new_ones(1)])
+    return points_where(points, left_out.index_select(0, owners))
 
 
 def ordered_features(
