@@ -32,32 +32,51 @@ struct Rows {
   int64_t k;
 };
 
-// Gradient of the loss of the rows begin .. end with respect to the weights, added to `slope`.
+// Calls use(j, index) for the K indices of a row, which are read two at a time: half the loads.
+template <int K, class Use>
+__attribute__((always_inline)) inline void for_indices(const int32_t* index, int64_t any_k,
+                                                       const Use& use) {
+  const int64_t k = K > 0 ? K : any_k;
+  asm("" : "+r"(index));  // else weights of many rows are gathered at once: half as long again
+  for (int64_t j = 0; j + 1 < k; j += 2) {
+    uint32_t pair[2];
+    uint64_t both;
+    std::memcpy(&both, index + j, sizeof(both));
+    std::memcpy(pair, &both, sizeof(both));
+    use(j, pair[0]);
+    use(j + 1, pair[1]);
+  }
+  if (k % 2) use(k - 1, uint32_t(index[k - 1]));
+}
+
+// Gradient of the loss of the rows begin .. end with respect to the weights, added to `slope`: the
+// residuals of some rows, then what they pull, so that no row waits for its own sigmoid.
 template <class T, int K>
 void add_gradient(const Rows<T>& rows, int64_t begin, int64_t end, const T* __restrict weights,
                   T* __restrict slope) {
-  constexpr int W = Simd<T>::W;
+  constexpr int kTogether = 64, W = Simd<T>::W;
   using V = typename Simd<T>::V;
   const int64_t k = K > 0 ? K : rows.k;
-  for (int64_t first = begin; first < end; first += W) {
-    const int lanes = int(std::min<int64_t>(W, end - first));
-    alignas(64) T log_odds[W] = {}, residual[W];
-    for (int lane = 0; lane < lanes; ++lane) {
-      const int32_t* index = rows.indices + (first + lane) * k;
-      const T* value = rows.values + (first + lane) * k;
-      asm("" : "+r"(index));  // else weights of many rows are gathered at once: half as long again
+  alignas(64) T at[kTogether] = {};  // log-odds, then probabilities
+  for (int64_t first = begin; first < end; first += kTogether) {
+    const int count = int(std::min<int64_t>(kTogether, end - first));
+    for (int i = 0; i < count; ++i) {
+      const T* value = rows.values + (first + i) * k;
       T sum = 0;
-      for (int64_t j = 0; j < k; ++j) sum += value[j] * weights[index[j]];
-      log_odds[lane] = sum;
+      for_indices<K>(rows.indices + (first + i) * k, k,
+                     [&](int64_t j, uint32_t index) { sum += value[j] * weights[index]; });
+      at[i] = sum;
     }
-    const V probability = sigmoid<T>(load<V>(log_odds));
-    std::memcpy(residual, &probability, sizeof(probability));
-    for (int lane = 0; lane < lanes; ++lane) {
-      const int64_t row = first + lane;
-      const int32_t* index = rows.indices + row * k;
+    for (int i = 0; i < kTogether; i += W) {
+      const V probability = sigmoid<T>(load<V>(at + i));
+      std::memcpy(at + i, &probability, sizeof(probability));
+    }
+    for (int i = 0; i < count; ++i) {
+      const int64_t row = first + i;
       const T* value = rows.values + row * k;
-      const T pull = rows.factors[row] * (residual[lane] - rows.labels[row]);
-      for (int64_t j = 0; j < k; ++j) slope[index[j]] += pull * value[j];
+      const T pull = rows.factors[row] * (at[i] - rows.labels[row]);
+      for_indices<K>(rows.indices + row * k, k,
+                     [&](int64_t j, uint32_t index) { slope[index] += pull * value[j]; });
     }
   }
 }
