@@ -1,10 +1,13 @@
 // Queries: the index, the k nearest centers, their kernel values, log-odds and probability.
 
+#include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <limits>
 #include <tuple>
 #include <vector>
 
+#include "candidates.h"
 #include "occupancy.h"
 #include "tensors.h"
 
@@ -12,8 +15,8 @@ namespace lardhm {
 namespace {
 
 // Neighbors of each point, ascending by row of the centers, and their kernel values where asked. Where
-// another order of the points is given they go to the point's place in it and are not sorted: sorting
-// would take longer than all else here, and who sums over them all does not need it.
+// another order of the points is given they go to the point's place in it and are not sorted: who sums
+// over them all does not need it.
 template <class T, int D, class Integer>
 struct NeighborVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
@@ -40,40 +43,56 @@ struct NeighborVisitor final : Visitor<T, D> {
   }
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
-    int64_t filled[Simd<T>::W] = {}, first[Simd<T>::W];
-    for (int lane = 0; lane < packet.lanes; ++lane) first[lane] = first_of(packet.row(lane));
-    for (int64_t j = 0; j < selected.size; ++j) {
-      const int64_t rank = selected.rank[j];
-      T value[Simd<T>::W];
-      if (values) {
-        V z[D];
-        whiten<T, D>(packet, positions + rank * Layout<D>::position,
-                     shapes + rank * Layout<D>::shape, z);
-        const V kernel = kernel_of<T, D>(z);
-        std::memcpy(value, &kernel, sizeof(kernel));
-      }
-      for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
-        const int lane = __builtin_ctz(bits);
-        const int64_t n = filled[lane]++;
-        if (places) {
-          rows[first[lane] + n] = Integer(order[rank]);
-          values[first[lane] + n] = value[lane];
-        } else {
-          insert(first[lane], n, Integer(order[rank]), value[lane]);
-        }
-      }
+    int64_t next[Simd<T>::W];
+    for (int lane = 0; lane < packet.lanes; ++lane) {  // there by the time that they are written
+      next[lane] = first_of(packet.row(lane));
+      __builtin_prefetch(rows + next[lane], 1);
+      if (values) __builtin_prefetch(values + next[lane], 1);
     }
+    std::vector<uint64_t> centers(selected.size);  // row of a center; where it stands in the selection
+    for (int64_t j = 0; j < selected.size; ++j)
+      centers[j] = uint64_t(order[selected.rank[j]]) << 32 | uint64_t(j);
+    if (!places) std::sort(centers.begin(), centers.end());
+    for (int64_t begin = 0; begin < selected.size; begin += kTogether)
+      add(packet, selected, centers.data() + begin,
+          int(std::min<int64_t>(kTogether, selected.size - begin)), next);
   }
 
-  void insert(int64_t first, int64_t n, Integer row, T value) const {
-    Integer* sorted = rows + first;
-    T* beside = values + first;
-    for (; n > 0 && sorted[n - 1] > row; --n) {
-      sorted[n] = sorted[n - 1];
-      if (values) beside[n] = beside[n - 1];
+  static constexpr int kTogether = 64;
+
+  // The kernels of n <= 64 centers, then lane by lane those it selected: nearly always k of them, so
+  // that the processor knows how long the loop is.
+  void add(const Packet<T, D>& packet, const Selection& selected, const uint64_t* centers, int n,
+           int64_t* next) const {
+    alignas(64) T kernel[kTogether][Simd<T>::W];
+    uint32_t bits[kTogether + kWide] = {};
+    for (int j = 0; j < n; ++j) {
+      const int64_t at = uint32_t(centers[j]), rank = selected.rank[at];
+      bits[j] = selected.bits[at];
+      if (!values) continue;
+      V z[D];
+      whiten<T, D>(packet, positions + rank * Layout<D>::position,
+                   shapes + rank * Layout<D>::shape, z);
+      const V value = kernel_of<T, D>(z);
+      std::memcpy(kernel[j], &value, sizeof(value));
     }
-    sorted[n] = row;
-    if (values) beside[n] = value;
+    for (int lane = 0; lane < packet.lanes; ++lane)
+      for (uint64_t own = members(bits, lane); own; own &= own - 1) {
+        const int j = __builtin_ctzll(own);
+        const int64_t to = next[lane]++;
+        rows[to] = Integer(centers[j] >> 32);
+        if (values) values[to] = kernel[j][lane];
+      }
+  }
+
+  // Which of the centers the lane selected.
+  static uint64_t members(const uint32_t* bits, int lane) {
+    uint64_t found = 0;
+    for (int i = 0; i < kTogether; i += kWide) {
+      const WideInt own = load<WideInt>(bits + i) & int32_t(1 << lane);
+      found |= uint64_t(~bits_le<WideInt>(own, WideInt{}) & existing(0, kWide)) << i;
+    }
+    return found;
   }
 };
 
