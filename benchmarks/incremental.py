@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -203,34 +204,45 @@ def speed_of(data: Path, name: str) -> list[Row]:
 
 
 def growth(arguments: argparse.Namespace) -> list[Row]:
-    """The next scans of a straight drive, 1 m apart, after 10, 100 and 1000 of them, timed in turn."""
+    """Scans of a straight drive, 1 m apart, each learned again and again, in turn."""
     rows: list[Row] = []
     for radius in (None, 60.0):
         model, kept = LardHilbertMap(), {}
-        for number in tqdm(range(1_000), "drive", disable=None):
-            drive_on(model, number, radius)
-            if number + 1 in (10, 100, 1_000):
-                kept[number + 1] = copy.deepcopy(model)
-        sizes = {scans: len(model) for scans, model in kept.items()}
+        for number in tqdm(range(999), "drive", disable=None):
+            drive_on(model, number, StreamConfig(radius=radius))
+            if number + 2 in (10, 40, 100, 1_000):
+                kept[number + 2] = copy.deepcopy(model)
         times: dict[int, list[float]] = {scans: [] for scans in kept}
         for turn in range(15):
             for scans, model in kept.items():
-                times[scans].append(seconds_of(partial(drive_on, model, scans + turn, radius)))
-        first = statistics.median(times[10][1:])
+                times[scans].append(seconds_again(model, scans - 1, turn, radius))
+        tenth = statistics.median(times[10][1:])
         for scans, model in kept.items():
-            median = statistics.median(times[scans][1:])
-            row: Row = {"forgets beyond m": radius or "never", "scans": scans}
-            row |= {"ms a scan": 1e3 * median, "ratio to the 10th": median / first}
+            row: Row = {"forgets beyond m": radius or "never", "scan": scans}
+            row["ms"] = 1e3 * statistics.median(times[scans][1:])
+            row["ratio to the 10th"] = statistics.median(times[scans][1:]) / tenth
             tensors = (*model.parameters(), *model.buffers())
             held = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
-            rows.append(row | {"clusters": sizes[scans], "map MB": held / 1e6})
+            rows.append(row | {"clusters": len(model), "map MB": held / 1e6})
     return rows
 
 
-def drive_on(model: LardHilbertMap, number: int, radius: float | None) -> None:
-    """One scan more; its simulation is part of the time, and the same everywhere."""
-    scan = street_scan(float(number), 20_000, seed=number)
-    stream_scans(model, [scan], StreamConfig(radius=radius, seed=number))
+def drive_on(model: LardHilbertMap, number: int, config: StreamConfig) -> None:
+    stream_scans(model, [street_scan(float(number), 20_000, number)], replace(config, seed=number))
+
+
+def seconds_again(model: LardHilbertMap, number: int, turn: int, radius: float | None) -> float:
+    """Time of one scan more, for a copy of the map; the scan before is learned first, so that the copy
+    has room as a map that grows has it."""
+    model = copy.deepcopy(model)
+    seeds = (number + 10_000 * turn, number + 10_000 * turn + 5_000)
+    before, scan = (
+        street_scan(float(number - 1 + i), 20_000, seed) for i, seed in enumerate(seeds)
+    )
+    stream_scans(model, [before], StreamConfig(radius=radius, seed=seeds[0]))
+    return seconds_of(
+        lambda: stream_scans(model, [scan], StreamConfig(radius=radius, seed=seeds[1]))
+    )
 
 
 def fading(arguments: argparse.Namespace) -> list[Row]:
@@ -262,7 +274,27 @@ def fading(arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
-PARTS = (accuracy, revisits, speed, growth, fading)
+def spacing(arguments: argparse.Namespace) -> list[Row]:
+    """A street of 80 m, scans so far apart: held-out rays at three places after the drive."""
+    rows = []
+    places = [street_scan(x, 8_000, 90_000 + int(x)) for x in (30.3, 40.1, 50.7)]
+    tests = [protocol_rays(scan) for scan in places]
+    for meters in (0.2, 0.5, 1.0, 2.0, 4.0):
+        model = LardHilbertMap()
+        for number in range(int(80 / meters)):
+            scan = street_scan(meters * number, 20_000, number)
+            stream_scans(model, [scan], StreamConfig(seed=number))
+        row: Row = {"meters between scans": meters, "scans": number + 1, "clusters": len(model)}
+        tables = [evaluate(model, test) for test in tests]
+        for kind in ("unif", "near"):
+            for score in ("balanced_accuracy", "log_loss"):
+                values = [table[kind][score] for table in tables]
+                row[f"{kind} {score}"] = statistics.mean(values)
+        rows.append(row)
+    return rows
+
+
+PARTS = (accuracy, revisits, speed, growth, fading, spacing)
 
 
 @torch.no_grad()

@@ -43,6 +43,7 @@ from lardhm_torch.replay import (
 )
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
+SMOOTHER = 2.0  # free space than surfaces: so many times the points before a cluster is too coarse
 REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
 LOOKED_AT = 4  # times as many points may contradict old clusters as train the weights
 # The map recalls its own leaning to hits, so that new points need no more of it.
@@ -59,6 +60,9 @@ class UpdateConfig:
     reach: float = 4.0  # nearer points make no new cluster
     fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
     refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
+    crowded: float = (
+        8.0  # for that, its past counts at most so many times the usual number of points
+    )
     max_points: int = 20_000  # that train the weights, at random; all points enter the clusters
     replay: int = 8  # points recalled from an old cluster; 0: train on new points only
     memory: float = 800.0  # a cluster's past counts at most as many points: the world may change
@@ -75,6 +79,8 @@ class UpdateConfig:
                 "zeta, refine and memory must be > 0 and fringe 0 or more; got "
                 f"{self.zeta}, {self.refine}, {self.memory} and {self.fringe}"
             )
+        if not self.crowded >= 2:
+            raise ValueError(f"crowded must be 2 or more; got {self.crowded}")
         if self.max_points < 1 or self.replay < 0:
             raise ValueError(
                 "max_points must be 1 or more and replay 0 or more; "
@@ -229,7 +235,10 @@ def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) ->
         return _Look(points, clusters, known.is_occupied, known.is_occupied)
     rule = (task.kernel.min_lengthscale, config.radius, config.reach)
     owners, found = explain(points, clusters, *rule)
-    outgrown = found.counts > config.refine * clusters.counts.clamp(min=2 * usual_count)
+    # many scans that each see a little more of a cluster must not hide that it has become too coarse
+    most = config.crowded if bool(known.is_occupied[0]) else SMOOTHER * config.crowded
+    past = clusters.counts.clamp(2 * usual_count, most * usual_count)
+    outgrown = found.counts > config.refine * past
     covered = outgrown & (_spread(found) > COVERED * _spread(clusters))
     found = Clusters(found.counts * ~outgrown, found.means, found.scatters)
     return _Look(unexplained(points, owners, ~outgrown), found, outgrown, covered)

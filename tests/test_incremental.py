@@ -308,6 +308,7 @@ def test_bad_samples_are_refused_and_the_map_is_as_it_was(points, labels, messag
     [
         ({"radius": 5.0}, "0 < radius <= reach; got 5.0 and 4.0"),
         ({"zeta": 0.0}, "zeta, refine and memory must be > 0"),
+        ({"crowded": 1.0}, "crowded must be 2 or more; got 1.0"),
         ({"max_points": 0}, "max_points must be 1 or more and replay 0 or more; got 0"),
     ],
 )
@@ -440,3 +441,17 @@ def test_revisits_hardly_grow_the_map(data, name):
         sizes.append(len(model.update(samples.points, samples.labels, seed=number)))
     assert sizes[1] <= 1.05 * sizes[0]
     assert sizes[10] <= 1.10 * sizes[0]
+
+
+def test_scans_that_each_see_a_little_more_make_finer_clusters():
+    """A robot that comes nearer sees a wall with a few more points each time, never with many more."""
+
+    def clusters_after(config):
+        model, rng = LardHilbertMap(), torch.Generator().manual_seed(0)
+        for turn in range(18):
+            wall = torch.rand(int(200 * 1.2**turn), 3, generator=rng, dtype=torch.float64)
+            points = wall * torch.tensor([8.0, 8.0, 0.02])
+            model.update(points, torch.ones(len(points)), seed=turn, config=config)
+        return len(model)
+
+    assert clusters_after(UpdateConfig()) > 3 * clusters_after(UpdateConfig(crowded=1e9))
