@@ -157,11 +157,9 @@ def octomap_job(scans: list[Scans]) -> Callable[[int], Any]:
 
 
 def speed(arguments: argparse.Namespace) -> list[Row]:
-    """Rays in memory to learned: the map, its real-time setting and OctoMap at 0.1 m, in turn.
-
-    A process of its own for each set: the tree of the one before would leave the heap in pieces,
-    and every large tensor be searched for.
-    """
+    """Rays in memory to learned: the map, its real-time setting and OctoMap at 0.1 m, in turn."""
+    # A process for each set: the tree of the one before would leave the heap in pieces, in which
+    # room for every large tensor is searched for.
     jobs = [(arguments.data, name) for name in ("kitti00_mulls", "sevenscenes_rgbd")]
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=fresh, max_tasks_per_child=1) as process:
