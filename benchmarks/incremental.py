@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -202,21 +201,24 @@ def speed_of(data: Path, name: str) -> list[Row]:
 
 
 def growth(arguments: argparse.Namespace) -> list[Row]:
-    """Scans of a straight drive, 1 m apart, each learned again and again, in turn."""
+    """Scans of a straight drive, each learned again and again, in turn."""
     rows: list[Row] = []
-    for radius in (None, 60.0):
+    for meters, radius in ((1.0, None), (1.0, 60.0), (4.0, None)):
         model, kept = LardHilbertMap(), {}
         for number in tqdm(range(999), "drive", disable=None):
-            drive_on(model, number, StreamConfig(radius=radius))
+            scan = street_scan(meters * number, 20_000, number)
+            stream_scans(model, [scan], StreamConfig(radius=radius, seed=number))
             if number + 2 in (10, 40, 100, 1_000):
                 kept[number + 2] = copy.deepcopy(model)
         times: dict[int, list[float]] = {scans: [] for scans in kept}
         for turn in range(15):
             for scans, model in kept.items():
-                times[scans].append(seconds_again(model, scans - 1, turn, radius))
+                places = [meters * (scans - 2), meters * (scans - 1)]
+                times[scans].append(seconds_again(model, places, turn, radius))
         tenth = statistics.median(times[10][1:])
         for scans, model in kept.items():
-            row: Row = {"forgets beyond m": radius or "never", "scan": scans}
+            row: Row = {"m between scans": meters, "forgets beyond m": radius or "never"}
+            row["scan"] = scans
             row["ms"] = 1e3 * statistics.median(times[scans][1:])
             row["ratio to the 10th"] = statistics.median(times[scans][1:]) / tenth
             tensors = (*model.parameters(), *model.buffers())
@@ -225,22 +227,18 @@ def growth(arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def drive_on(model: LardHilbertMap, number: int, config: StreamConfig) -> None:
-    stream_scans(model, [street_scan(float(number), 20_000, number)], replace(config, seed=number))
-
-
-def seconds_again(model: LardHilbertMap, number: int, turn: int, radius: float | None) -> float:
-    """Time of one scan more, for a copy of the map; the scan before is learned first, so that the copy
-    has room as a map that grows has it."""
-    model = copy.deepcopy(model)
-    seeds = (number + 10_000 * turn, number + 10_000 * turn + 5_000)
+def seconds_again(
+    model: LardHilbertMap, places: list[float], turn: int, radius: float | None
+) -> float:
+    """Time of the scan at the second place, for a copy of the map; the one at the first is learned
+    before, so that the copy has room as a map that grows has it."""
+    model, seeds = copy.deepcopy(model), (10_000 + 2 * turn, 10_001 + 2 * turn)
     before, scan = (
-        street_scan(float(number - 1 + i), 20_000, seed) for i, seed in enumerate(seeds)
+        street_scan(place, 20_000, seed) for place, seed in zip(places, seeds, strict=True)
     )
     stream_scans(model, [before], StreamConfig(radius=radius, seed=seeds[0]))
-    return seconds_of(
-        lambda: stream_scans(model, [scan], StreamConfig(radius=radius, seed=seeds[1]))
-    )
+    config = StreamConfig(radius=radius, seed=seeds[1])
+    return seconds_of(lambda: stream_scans(model, [scan], config))
 
 
 def fading(arguments: argparse.Namespace) -> list[Row]:

@@ -60,9 +60,7 @@ class UpdateConfig:
     reach: float = 4.0  # nearer points make no new cluster
     fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
     refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
-    crowded: float = (
-        8.0  # for that, its past counts at most so many times the usual number of points
-    )
+    crowded: float = 8.0  # in that, a past counts at most so many times the usual points
     max_points: int = 20_000  # that train the weights, at random; all points enter the clusters
     replay: int = 8  # points recalled from an old cluster; 0: train on new points only
     memory: float = 800.0  # a cluster's past counts at most as many points: the world may change
