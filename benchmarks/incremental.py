@@ -215,12 +215,12 @@ def growth(arguments: argparse.Namespace) -> list[Row]:
             for scans, model in kept.items():
                 places = [meters * (scans - 2), meters * (scans - 1)]
                 times[scans].append(seconds_again(model, places, turn, radius))
-        tenth = statistics.median(times[10][1:])
+        medians = {scans: statistics.median(seconds[1:]) for scans, seconds in times.items()}
         for scans, model in kept.items():
             row: Row = {"m between scans": meters, "forgets beyond m": radius or "never"}
             row["scan"] = scans
-            row["ms"] = 1e3 * statistics.median(times[scans][1:])
-            row["ratio to the 10th"] = statistics.median(times[scans][1:]) / tenth
+            row["ms"] = 1e3 * medians[scans]
+            row["ratio to the 10th"] = medians[scans] / medians[10]
             tensors = (*model.parameters(), *model.buffers())
             held = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
             rows.append(row | {"clusters": len(model), "map MB": held / 1e6})

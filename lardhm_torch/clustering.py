@@ -6,8 +6,9 @@ each center are its moments (eq. 6, 7), which pool exactly when clusters merge.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,8 +25,16 @@ START_POINTS = 50  # a center, drawn at random, among which the start is chosen
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
+class Columns:
+    """A dataclass of tensors with as many rows each: iterates over them, in order."""
+
+    def __iter__(self: Any) -> Iterator[Tensor]:
+        """The tensors."""
+        return (getattr(self, field.name) for field in fields(self))
+
+
 @dataclass(frozen=True)
-class Clusters:
+class Clusters(Columns):
     """Moments of M clusters: enough to pool them, nothing that training changes.
 
     Args:
@@ -64,7 +73,7 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     clusters = merge_small(clusters_about(centers, counts, sums, scatters))
     # Neighbors in space are neighbors in memory: queries of large maps are faster.
     order = z_order(clusters.means)
-    return Clusters(clusters.counts[order], clusters.means[order], clusters.scatters[order])
+    return Clusters(*(moments[order] for moments in clusters))
 
 
 def cluster_classes(
@@ -125,11 +134,7 @@ def points_where(points: Tensor, mask: Tensor) -> Tensor:
 
 def concatenate_clusters(parts: list[Clusters]) -> Clusters:
     """All clusters of several, in order."""
-    return Clusters(
-        torch.cat([part.counts for part in parts]),
-        torch.cat([part.means for part in parts]),
-        torch.cat([part.scatters for part in parts]),
-    )
+    return Clusters(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lardhm_torch import checkpoint
-from lardhm_torch.clustering import Clusters
+from lardhm_torch.clustering import Clusters, Columns
 
 OF_THE_WHOLE = ("origin", "posterior_scales")  # tensors that are not a row a cluster
 RESERVE = 0.25  # of a map's clusters: room that a growing map keeps for more
@@ -101,7 +100,7 @@ def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
 
 
 @dataclass(frozen=True)
-class MapState:
+class MapState(Columns):
     """Everything a map knows but its origin: M rows each (see `LardHilbertMap`)."""
 
     weights: Tensor
@@ -111,10 +110,6 @@ class MapState:
     counts: Tensor
     means: Tensor
     scatters: Tensor
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """The tensors, in order."""
-        return (getattr(self, field.name) for field in fields(self))
 
     def rows(self, which: Tensor) -> MapState:
         """The clusters of a mask or of indices, in that order, as copies."""

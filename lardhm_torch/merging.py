@@ -79,8 +79,7 @@ def merge_clusters(
 def take_clusters(clusters: Clusters, rows: Tensor) -> Clusters:
     """The clusters of a mask or of indices, in that order."""
     rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
-    tensors = (clusters.counts, clusters.means, clusters.scatters)
-    return Clusters(*(tensor.index_select(0, rows) for tensor in tensors))
+    return Clusters(*(moments.index_select(0, rows) for moments in clusters))
 
 
 def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> MapState:
@@ -91,8 +90,7 @@ def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> 
     before = known.rows(where)
     if native.supports(before.means):
         tensors = (before.counts, before.means, before.scatters, before.raw_scale_tril)
-        new = (found.counts, found.means, found.scatters)
-        *moments, shift, moved = torch.ops.lardhm.pool(*tensors, *new, floor)
+        *moments, shift, moved = torch.ops.lardhm.pool(*tensors, *found, floor)
         pooled = Clusters(*moments)
     else:
         pooled, shift, moved = _pooled(before, found, floor)
@@ -133,5 +131,4 @@ def append_clusters(
     raw = raw_factors(factor_covariances(new.covariances, floor))
     where = known.counts[:0] if where is None else where
     weights = torch.cat([known.weights[where], raw.new_zeros(len(new) - len(where))])
-    moments = (new.counts, new.means, new.scatters)
-    return known.put(where, MapState(weights, new.means, raw, is_occupied, *moments))
+    return known.put(where, MapState(weights, new.means, raw, is_occupied, *new))

@@ -6,14 +6,19 @@ held to be true there; points drawn from the moments, labelled by the map, stand
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import MIN_COUNT, along_curve, factor_covariances, spread_rows
+from lardhm_torch.clustering import (
+    MIN_COUNT,
+    Columns,
+    along_curve,
+    factor_covariances,
+    spread_rows,
+)
 from lardhm_torch.features import Kernel
 from lardhm_torch.fitting import FitConfig, class_factors, deal_samples, fit_weights
 from lardhm_torch.map_state import MapState
@@ -24,7 +29,7 @@ KEPT = 0.25  # of a contradicted cluster's past
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Evidence(Columns):
     """What weights learn from: N points with a target each, and how much each counts.
 
     ``labels`` are 0 to 1: a recalled point has the probability that the map gave it. ``is_occupied``
@@ -35,10 +40,6 @@ class Evidence:
     labels: Tensor
     is_occupied: Tensor
     strength: Tensor
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """The columns, in order."""
-        return (getattr(self, field.name) for field in fields(self))
 
     def __len__(self) -> int:
         """Number of points N."""

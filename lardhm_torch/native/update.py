@@ -53,9 +53,8 @@ def explain(
         clusters, of none the cluster's own mean and no scatter. Sums are taken in float64.
     """
     if native.supports(points):
-        given = (clusters.counts, clusters.means, clusters.scatters)
         rule = (floor, radius, reach)
-        owners, *moments = torch.ops.lardhm.explain(points.detach(), *given, *rule)
+        owners, *moments = torch.ops.lardhm.explain(points.detach(), *clusters, *rule)
         return owners, Clusters(*moments)
     centers, factors = clusters.means, factor_covariances(clusters.covariances, floor)
     count, dim = centers.shape
@@ -89,8 +88,7 @@ def possibly_inside(points: Tensor, clusters: Clusters, floor: float, radius: fl
         radius: standard deviations within which a point is inside.
     """
     if native.supports(points):
-        moments = (clusters.counts, clusters.means, clusters.scatters)
-        return torch.ops.lardhm.possibly_inside(points.detach(), *moments, floor, radius)
+        return torch.ops.lardhm.possibly_inside(points.detach(), *clusters, floor, radius)
     return points if len(clusters) else points[:0]
 
 
