@@ -24,8 +24,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import LardHilbertMap, Scans, load_scans, sample_rays, split_rays
-from lardhm_torch.baselines.octomap import OctoMapBaseline
-from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 
 Model = Callable[[Tensor], Tensor]
 System = Callable[[Scans, int], Model]

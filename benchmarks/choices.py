@@ -32,8 +32,8 @@ from lardhm_torch import (
     sample_rays,
     split_rays,
 )
-from lardhm_torch.fitting import fit_weights
-from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
+from lardhm_torch.learning.fitting import fit_weights
 
 Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
 

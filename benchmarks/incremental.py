@@ -35,9 +35,9 @@ from lardhm_torch import (
     split_rays,
     stream_scans,
 )
-from lardhm_torch.baselines.octomap import new_tree, to_array
-from lardhm_torch.clustering import along_curve, cluster_each, split_classes
-from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch.evaluation.baselines.octomap import new_tree, to_array
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
+from lardhm_torch.learning.clustering import along_curve, cluster_each, split_classes
 from lardhm_torch.streaming import real_time
 
 SETS = (

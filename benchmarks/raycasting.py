@@ -19,9 +19,9 @@ from conditions import conditions, describe
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap, load_scans, raycast, sample_rays, split_rays
-from lardhm_torch.baselines.octomap import OctoMapBaseline
-from lardhm_torch.metrics import protocol_rays
-from lardhm_torch.segments import expected_range
+from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
+from lardhm_torch.evaluation.held_out import protocol_rays
+from lardhm_torch.queries.collision import expected_range
 
 SETS = (
     "paper_virtual",

@@ -35,13 +35,13 @@ from timing import Contender, compare, format_comparison, format_rows
 from workers import plain_path
 
 from lardhm_torch import FitConfig, LardHilbertMap, native
-from lardhm_torch.clustering import (
+from lardhm_torch.learning.clustering import (
     along_curve,
     clusters_about,
     factor_covariances,
     mini_batch_kmeans,
 )
-from lardhm_torch.fitting import deal_samples, fit_weights
+from lardhm_torch.learning.fitting import deal_samples, fit_weights
 
 # Table I and II of the paper [ms]: 8 cores of 2.5 GHz, 500 clusters.
 PAPER_STAGES = {

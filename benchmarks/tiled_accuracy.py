@@ -20,7 +20,7 @@ from accuracy import Scores, find_sets, lard_hilbert_map
 from conditions import ROOT, conditions, describe, write_json
 
 from lardhm_torch import Scans, TiledMap, load_scans, split_rays
-from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.tiles.fitting import fit_tiles
 from lardhm_torch.tiles.routing import TilingConfig, tile_scans
 

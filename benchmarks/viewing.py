@@ -18,7 +18,7 @@ from conditions import conditions, describe
 from playwright.sync_api import Page
 
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays
-from lardhm_torch.viewer import MapViewer, ViewConfig
+from lardhm_torch.viewing.viewer import MapViewer, ViewConfig
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from chromium import chromium

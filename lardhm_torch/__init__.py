@@ -6,43 +6,43 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lardhm_torch.fitting import FitConfig
     from lardhm_torch.hilbert_map import LardHilbertMap
-    from lardhm_torch.incremental import UpdateConfig
-    from lardhm_torch.io import iter_scans, load_scans, save_scans
-    from lardhm_torch.joining import merge_maps
-    from lardhm_torch.map_state import resize_optimizer
-    from lardhm_torch.meshing import extract_mesh
-    from lardhm_torch.querying import grid
-    from lardhm_torch.rays import raycast
+    from lardhm_torch.io.scan_files import iter_scans, load_scans, save_scans
+    from lardhm_torch.learning.fine_tuning import TuneConfig, fine_tune
+    from lardhm_torch.learning.fitting import FitConfig
+    from lardhm_torch.learning.map_merging import merge_maps
+    from lardhm_torch.learning.parameters import resize_optimizer
+    from lardhm_torch.learning.update import UpdateConfig
+    from lardhm_torch.queries.grids import grid
+    from lardhm_torch.queries.raycasting import raycast
     from lardhm_torch.sampling import Samples, SamplingConfig, sample_rays
     from lardhm_torch.scans import Scans, split_rays
     from lardhm_torch.simulation import simulate_room
     from lardhm_torch.streaming import StreamConfig, resume_stream, stream_scans
+    from lardhm_torch.surfaces.meshing import extract_mesh
     from lardhm_torch.tiles.tiled_map import TiledMap
-    from lardhm_torch.tuning import TuneConfig, fine_tune
 
 _ROOM_OF = {
-    "FitConfig": "fitting",
+    "FitConfig": "learning.fitting",
     "LardHilbertMap": "hilbert_map",
     "Samples": "sampling",
     "SamplingConfig": "sampling",
     "Scans": "scans",
     "StreamConfig": "streaming",
     "TiledMap": "tiles.tiled_map",
-    "TuneConfig": "tuning",
-    "UpdateConfig": "incremental",
-    "extract_mesh": "meshing",
-    "fine_tune": "tuning",
-    "grid": "querying",
-    "iter_scans": "io",
-    "load_scans": "io",
-    "merge_maps": "joining",
-    "raycast": "rays",
-    "resize_optimizer": "map_state",
+    "TuneConfig": "learning.fine_tuning",
+    "UpdateConfig": "learning.update",
+    "extract_mesh": "surfaces.meshing",
+    "fine_tune": "learning.fine_tuning",
+    "grid": "queries.grids",
+    "iter_scans": "io.scan_files",
+    "load_scans": "io.scan_files",
+    "merge_maps": "learning.map_merging",
+    "raycast": "queries.raycasting",
+    "resize_optimizer": "learning.parameters",
     "resume_stream": "streaming",
     "sample_rays": "sampling",
-    "save_scans": "io",
+    "save_scans": "io.scan_files",
     "simulate_room": "simulation",
     "split_rays": "scans",
     "stream_scans": "streaming",

@@ -9,11 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lardhm_torch import checkpoint, joining, map_state, native, uncertainty
-from lardhm_torch.clustering import Clusters, along_curve, cluster_classes, factor_covariances
+from lardhm_torch import native
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
-from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
-from lardhm_torch.incremental import Task, UpdateConfig, updated
+from lardhm_torch.io import map_files
+from lardhm_torch.learning import map_merging, parameters, posterior
+from lardhm_torch.learning.clustering import (
+    Clusters,
+    along_curve,
+    cluster_classes,
+    factor_covariances,
+)
+from lardhm_torch.learning.fitting import FitConfig, deal_samples, fit_weights
+from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.sampling import check_samples
 
 FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
@@ -90,11 +97,11 @@ class LardHilbertMap(nn.Module):
         self.register_buffer("posterior_means", torch.zeros(0))
         self.register_buffer("posterior_variances", torch.zeros(0))
         self.register_buffer("posterior_scales", torch.ones(2))
-        self.register_load_state_dict_pre_hook(uncertainty.fill_missing)
+        self.register_load_state_dict_pre_hook(posterior.fill_missing)
         self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
         self._index = torch.empty(0, dtype=torch.uint8)
-        self._reserves: dict[str, tuple[int, int]] = {}  # of `map_state.resize`
-        self.register_load_state_dict_pre_hook(map_state.make_room)
+        self._reserves: dict[str, tuple[int, int]] = {}  # of `parameters.resize`
+        self.register_load_state_dict_pre_hook(parameters.make_room)
 
     # --- what the map knows ---
 
@@ -155,7 +162,7 @@ class LardHilbertMap(nn.Module):
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
         mean, variance = self._posterior(points)
-        return uncertainty.moderate(mean, uncertainty.OWN_SHARE * variance)
+        return posterior.moderate(mean, posterior.OWN_SHARE * variance)
 
     def _posterior(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the log-odds at (..., D) points."""
@@ -166,11 +173,11 @@ class LardHilbertMap(nn.Module):
             )
         local = self._to_map_frame(points)
         parts = []
-        for chunk in local.reshape(-1, self.dim).split(uncertainty.QUERY_CHUNK):
+        for chunk in local.reshape(-1, self.dim).split(posterior.QUERY_CHUNK):
             indices, values = self._nearest_features(chunk)
             mean = (values * self.posterior_means[indices]).sum(dim=1)
-            mean = uncertainty.posterior_log_odds(mean, self.posterior_scales)
-            variance = uncertainty.latent_variance(indices, values, self.posterior_variances)
+            mean = posterior.posterior_log_odds(mean, self.posterior_scales)
+            variance = posterior.latent_variance(indices, values, self.posterior_variances)
             parts.append(torch.stack([mean, variance]))
         mean, variance = torch.cat(parts, dim=1).reshape(2, *local.shape[:-1])
         return mean, variance
@@ -310,9 +317,9 @@ class LardHilbertMap(nn.Module):
         points, labels = check_samples(points, labels, self.dim, self.origin.device)
         indices, values = self._nearest_features(self._to_map_frame(points))
         log_odds = (values * self.weights[indices]).sum(dim=1)
-        variances = uncertainty.weight_variances(indices, values, log_odds, len(self))
+        variances = posterior.weight_variances(indices, values, log_odds, len(self))
         samples = (indices, values, log_odds, labels.to(values.dtype))
-        self.posterior_scales = uncertainty.posterior_scales(*samples, variances)
+        self.posterior_scales = posterior.posterior_scales(*samples, variances)
         self.posterior_means, self.posterior_variances = self.weights.detach().clone(), variances
         return self
 
@@ -329,7 +336,7 @@ class LardHilbertMap(nn.Module):
 
         New points join the clusters that explain them, the others make new ones; then the weights
         near the scan are trained on the new points and on what the map recalls. Parameters stay
-        the same objects (see `map_state.resize_optimizer` for an optimizer with a state). If
+        the same objects (see `parameters.resize_optimizer` for an optimizer with a state). If
         anything fails, the map is as it was.
 
         Args:
@@ -357,9 +364,9 @@ class LardHilbertMap(nn.Module):
         rng = torch.Generator(device=points.device).manual_seed(seed)
         task = Task(self.kernel, config or UpdateConfig(), rng)
         local = self._to_map_frame(points)
-        state = map_state.read_state(self)
+        state = parameters.read_state(self)
         changes = updated(state, local, labels.to(local.dtype), num_clusters, task)
-        map_state.write_rows(self, *changes)
+        parameters.write_rows(self, *changes)
         return self
 
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
@@ -377,10 +384,10 @@ class LardHilbertMap(nn.Module):
         Raises:
             ValueError: wrong shapes, or rotation is not a rotation.
         """
-        state, origin = joining.moved(
-            map_state.read_state(self), self.origin, rotation, translation
+        state, origin = map_merging.moved(
+            parameters.read_state(self), self.origin, rotation, translation
         )
-        map_state.write_state(self, state)
+        parameters.write_state(self, state)
         self.origin = origin
         return self
 
@@ -398,9 +405,9 @@ class LardHilbertMap(nn.Module):
             raise ValueError(f"center must be ({self.dim},) and finite; got {center.tolist()}")
         if not radius > 0:
             raise ValueError(f"radius must be > 0 m; got {radius}")
-        state = map_state.read_state(self)
+        state = parameters.read_state(self)
         local = self._to_map_frame(center)
-        map_state.write_state(self, joining.within(state, local, radius))
+        parameters.write_state(self, map_merging.within(state, local, radius))
         return self
 
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
@@ -428,7 +435,7 @@ class LardHilbertMap(nn.Module):
     def _grow(self, clusters: Clusters, is_occupied: Tensor, origin: Tensor) -> None:
         """Take over clusters as centers and length-scales, with weights of 0."""
         factors = factor_covariances(clusters.covariances, self.min_lengthscale)
-        map_state.resize(self, len(clusters))
+        parameters.resize(self, len(clusters))
         with torch.no_grad():
             self.weights.zero_()
             self.centers.copy_(clusters.means)
@@ -450,14 +457,14 @@ class LardHilbertMap(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Format version and settings, kept in the state dict beside the tensors."""
-        return {"format_version": checkpoint.FORMAT_VERSION, **self.settings}
+        return {"format_version": map_files.FORMAT_VERSION, **self.settings}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Nothing to set: `map_state.make_room` has checked that the settings agree."""
+        """Nothing to set: `parameters.make_room` has checked that the settings agree."""
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map to a file, atomically: `torch.save(model.state_dict(), path)`, but safe."""
-        checkpoint.save_state(self.state_dict(), path)
+        map_files.save_state(self.state_dict(), path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:
@@ -467,10 +474,10 @@ class LardHilbertMap(nn.Module):
             FileNotFoundError: there is no such file.
             ValueError: the file is not a map, is damaged, unsafe, or of a newer format.
         """
-        state = checkpoint.load_state(path)
-        state.pop(checkpoint.STREAM_KEY, None)  # a checkpoint of a stream is a map, too
+        state = map_files.load_state(path)
+        state.pop(map_files.STREAM_KEY, None)  # a checkpoint of a stream is a map, too
         try:
-            settings = checkpoint.check_settings(state.get("_extra_state"))
+            settings = map_files.check_settings(state.get("_extra_state"))
             if state["centers"].shape[1:] != (settings["dim"],):
                 raise ValueError(
                     f"centers must be (M, {settings['dim']}); got {tuple(state['centers'].shape)}"

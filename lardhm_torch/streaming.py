@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from lardhm_torch import checkpoint
-from lardhm_torch.clustering import scan_clusters, split_classes
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.incremental import UpdateConfig
+from lardhm_torch.io import map_files
+from lardhm_torch.learning.clustering import scan_clusters, split_classes
+from lardhm_torch.learning.update import UpdateConfig
 from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
 from lardhm_torch.scans import Scans
 
@@ -134,7 +134,7 @@ def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progres
         FileNotFoundError: there is no such file.
         ValueError: the file is not a map, or not one that a stream wrote.
     """
-    found = checkpoint.load_state(path).get(checkpoint.STREAM_KEY)
+    found = map_files.load_state(path).get(map_files.STREAM_KEY)
     if not isinstance(found, dict) or not all(
         isinstance(found.get(name), int) for name in ("scans", "rays")
     ):
@@ -150,7 +150,7 @@ def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progres
 
 def _save(model: LardHilbertMap, seen: Progress, path: str | os.PathLike[str]) -> None:
     stream = {"scans": seen.scans, "rays": seen.rays}
-    checkpoint.save_state({**model.state_dict(), checkpoint.STREAM_KEY: stream}, path)
+    map_files.save_state({**model.state_dict(), map_files.STREAM_KEY: stream}, path)
 
 
 def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig) -> None:

@@ -16,10 +16,12 @@ from lardhm_torch import (
     simulate_room,
     split_rays,
 )
-from lardhm_torch.mesh_files import save_mesh
-from lardhm_torch.metrics import evaluate, format_metrics, mesh_metrics
-from lardhm_torch.rendering import render_mesh, render_slice
+from lardhm_torch.evaluation.held_out import evaluate
+from lardhm_torch.evaluation.mesh_distances import mesh_metrics
+from lardhm_torch.evaluation.scores import format_metrics
+from lardhm_torch.io.mesh_files import save_mesh
 from lardhm_torch.simulation import room_mesh
+from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
 
 def main(folder: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lardhm_torch import LardHilbertMap, extract_mesh, load_scans, sample_rays
-from lardhm_torch.rendering import render_mesh
+from lardhm_torch.viewing.rendering import render_mesh
 
 VIEWS: dict[str, dict[str, Any]] = {  # 7-Scenes is in the frame of its first camera: -y is up
     "sevenscenes_rgbd": {"up": (0, -1, 0), "azimuth": -105, "elevation": 25},

@@ -14,7 +14,7 @@ from matplotlib.patches import Ellipse
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap, Scans, sample_rays
-from lardhm_torch.querying import query_slice
+from lardhm_torch.queries.grids import query_slice
 
 BOUNDS = ([-3.3, -2.3], [3.3, 2.3])  # [m]
 BOX, PILLAR = (3.0, 2.0), (1.2, 0.3, 0.6)  # [m] half edges of the room; x, y, radius in it

@@ -37,7 +37,7 @@ from healthy_files import (
 )
 
 from lardhm_torch import LardHilbertMap
-from lardhm_torch.io import load_points, load_scans, save_scans
+from lardhm_torch.io.scan_files import load_points, load_scans, save_scans
 from lardhm_torch.scans import Scans
 
 SECONDS_A_FILE = 5  # of the processor

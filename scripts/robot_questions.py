@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap, raycast, sample_rays, simulate_room
-from lardhm_torch.bounding import clearance
-from lardhm_torch.exploring import frontiers, information_gain
-from lardhm_torch.querying import grid, occupancy_gradient, query_slice
-from lardhm_torch.segments import Mover, expected_range, free_probability
+from lardhm_torch.queries.collision import Mover, clearance, expected_range, free_probability
+from lardhm_torch.queries.exploration import frontiers, information_gain
+from lardhm_torch.queries.grids import grid, occupancy_gradient, query_slice
 
 HEIGHT = 1.1  # [m]
 BOUNDS = ([0.0, 0.0], [8.0, 5.0])  # [m]

@@ -9,7 +9,7 @@ from pathlib import Path
 from chromium import chromium
 
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays
-from lardhm_torch.viewer import MapViewer
+from lardhm_torch.viewing.viewer import MapViewer
 
 
 def main(scans_path: str, picture: Path) -> None:

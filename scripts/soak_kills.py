@@ -20,8 +20,15 @@ from pathlib import Path
 
 import torch
 
-from lardhm_torch import LardHilbertMap, Scans, resume_stream, save_scans, simulate_room, split_rays
-from lardhm_torch.metrics import evaluate
+from lardhm_torch import (
+    LardHilbertMap,
+    Scans,
+    resume_stream,
+    save_scans,
+    simulate_room,
+    split_rays,
+)
+from lardhm_torch.evaluation.held_out import evaluate
 from lardhm_torch.scans import concatenate_scans
 
 TOLERANCE = 0.005  # of the accuracy

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lardhm_torch.io import save_scans
+from lardhm_torch.io.scan_files import save_scans
 from lardhm_torch.scans import Scans
 
 RAMP = np.arange(160, dtype="<u2").tobytes()

@@ -9,8 +9,8 @@ import trimesh
 from healthy_files import BagMaker, bag_messages
 
 from lardhm_torch import LardHilbertMap, Scans, load_scans, save_scans
-from lardhm_torch.checkpoint import save_state
 from lardhm_torch.cli import main
+from lardhm_torch.io.map_files import save_state
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_tuning_that_was_interrupted_goes_on_from_its_state(folder, monkeypatch)
             raise KeyboardInterrupt
 
     kept = ("--tune-state", folder / "state.pt", "-o", folder / "resumed.pt")
-    monkeypatch.setattr("lardhm_torch.checkpoint.save_state", interrupt)
+    monkeypatch.setattr("lardhm_torch.io.map_files.save_state", interrupt)
     assert main([str(word) for word in (*words, *kept)]) == 130
     monkeypatch.undo()
     run(*words, *kept)

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from sklearn.cluster import MiniBatchKMeans
 
 from lardhm_torch import native
-from lardhm_torch.clustering import (
+from lardhm_torch.features import nearest_centers, squared_distances
+from lardhm_torch.learning.clustering import (
     Clusters,
     choose_num_clusters,
     cluster_classes,
@@ -19,7 +20,6 @@ from lardhm_torch.clustering import (
     split_clusters,
     z_order,
 )
-from lardhm_torch.features import nearest_centers, squared_distances
 
 F64 = torch.float64
 

@@ -3,9 +3,10 @@ import pytest
 import torch
 from sklearn.linear_model import LogisticRegression
 
-from lardhm_torch import fitting, native
+from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors, nearest_features
-from lardhm_torch.fitting import (
+from lardhm_torch.learning import fitting
+from lardhm_torch.learning.fitting import (
     FitConfig,
     balance_classes,
     batch_gradient,

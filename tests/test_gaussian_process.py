@@ -5,7 +5,7 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-from lardhm_torch.baselines.gaussian_process import (
+from lardhm_torch.evaluation.baselines.gaussian_process import (
     Hyperparameters,
     condition,
     learn_hyperparameters,
@@ -16,8 +16,8 @@ from lardhm_torch.baselines.gaussian_process import (
     squash,
     thin_plate,
 )
-from lardhm_torch.baselines.gp_implicit_surface import GPImplicitSurface
-from lardhm_torch.baselines.gp_occupancy_map import MAX_POINTS, GPOccupancyMap
+from lardhm_torch.evaluation.baselines.gp_implicit_surface import GPImplicitSurface
+from lardhm_torch.evaluation.baselines.gp_occupancy_map import MAX_POINTS, GPOccupancyMap
 
 F64 = torch.float64
 SCALE = Hyperparameters(*torch.tensor([0.4, 1.5, 0.05], dtype=F64))

@@ -296,7 +296,7 @@ def test_all_public_names_exist():
     [("paper_virtual", 0.99, 0.975), ("sevenscenes_semidense", 0.99, 0.985)],
 )
 def test_held_out_rays_of_real_scans_are_predicted(data, name, unif, near):
-    from lardhm_torch.metrics import evaluate
+    from lardhm_torch.evaluation.held_out import evaluate
 
     scans = load_scans(data / name / "scans.npz")
     scans = scans.select(torch.randperm(len(scans), generator=torch.Generator().manual_seed(0)))

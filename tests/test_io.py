@@ -5,7 +5,7 @@ import pytest
 import torch
 from scan_files import as_text, pcd_header, ply_header, some_points, write_by_hand
 
-from lardhm_torch.io import load_scans, save_scans
+from lardhm_torch.io.scan_files import load_scans, save_scans
 from lardhm_torch.scans import Scans
 
 

@@ -11,8 +11,8 @@ import pytest
 from healthy_files import CLOUD_TOPIC, BagMaker, bag_messages
 from scan_files import real_scans, some_points, turning_poses
 
-from lardhm_torch.io import load_points, load_scans
 from lardhm_torch.io.bag_chunks import Unpacker
+from lardhm_torch.io.scan_files import load_points, load_scans
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra io)")
 

@@ -9,8 +9,8 @@ import pytest
 from fuzz_readers import available_formats
 from scan_files import CUT, LAS, some_points, whole_file, write_by_hand
 
-from lardhm_torch import io
-from lardhm_torch.io import load_points, load_scans
+from lardhm_torch.io import scan_files
+from lardhm_torch.io.scan_files import load_points, load_scans
 
 
 @pytest.mark.parametrize("name", [*CUT, *LAS])
@@ -42,7 +42,7 @@ def test_a_hundred_broken_files_of_each_format_neither_crash_nor_hang(names):
 @pytest.mark.parametrize(
     "content", [b"", b"\0" * 301, b"\xff" * 301, b"<html>no scan</html>\n" * 9]
 )
-@pytest.mark.parametrize("extension", sorted({*io._READERS, ".npy"}))
+@pytest.mark.parametrize("extension", sorted({*scan_files._READERS, ".npy"}))
 def test_garbage_is_an_error_that_names_the_file(tmp_path, extension, content):
     path = tmp_path / f"scan{extension}"
     path.write_bytes(content)
@@ -120,7 +120,7 @@ def test_a_file_that_may_not_be_opened_keeps_its_own_error(tmp_path, monkeypatch
     def refuse(path):
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setitem(io._READERS, ".csv", refuse)
+    monkeypatch.setitem(scan_files._READERS, ".csv", refuse)
     path = write_by_hand(tmp_path, "csv-header", some_points())
     with pytest.raises(PermissionError, match=r"scan\.csv"):
         load_scans(path)

@@ -7,7 +7,7 @@ import pytest
 from healthy_files import checksums_mended, write_e57
 from scan_files import real_scans, some_points, turning_poses
 
-from lardhm_torch.io import load_points, load_scans
+from lardhm_torch.io.scan_files import load_points, load_scans
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is not installed (extra io)")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scan_files import real_scans, some_points, turning_poses, write_kitti, write_poses
 
-from lardhm_torch.io import load_scans
+from lardhm_torch.io.scan_files import load_scans
 
 
 @pytest.mark.parametrize("where", ["beside", "above"])

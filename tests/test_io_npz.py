@@ -5,7 +5,7 @@ import pytest
 import torch
 from scan_files import UTM, real_scans, some_points, whole_file
 
-from lardhm_torch.io import load_points, load_scans, save_scans
+from lardhm_torch.io.scan_files import load_points, load_scans, save_scans
 from lardhm_torch.scans import Scans
 
 

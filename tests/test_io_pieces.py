@@ -6,7 +6,7 @@ import torch
 from scan_files import UTM, needs_laspy, some_points, write_las
 
 from lardhm_torch import Scans, save_scans
-from lardhm_torch.io import iter_pieces, load_scans
+from lardhm_torch.io.scan_files import iter_pieces, load_scans
 from lardhm_torch.scans import concatenate_scans
 
 

@@ -15,8 +15,8 @@ from scan_files import (
     write_poses,
 )
 
-from lardhm_torch.io import load_scans
 from lardhm_torch.io.poses import read_poses
+from lardhm_torch.io.scan_files import load_scans
 from lardhm_torch.io.trajectories import Trajectory
 
 STAMPS = 1.7e9 + np.arange(3)

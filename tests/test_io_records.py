@@ -14,8 +14,8 @@ from scan_files import (
     write_by_hand,
 )
 
-from lardhm_torch.io import load_points, load_scans
 from lardhm_torch.io.pcd import decompress_lzf
+from lardhm_torch.io.scan_files import load_points, load_scans
 
 
 @pytest.mark.parametrize("name", HAND_MADE)

@@ -8,7 +8,7 @@ import pytest
 from healthy_files import write_depth_images, write_tum
 from scan_files import real_scans, turning_poses
 
-from lardhm_torch.io import Camera, load_scans
+from lardhm_torch.io.scan_files import Camera, load_scans
 
 Image = pytest.importorskip("PIL.Image", reason="pillow is not installed (extra io)")
 

@@ -2,9 +2,13 @@ import pytest
 import torch
 from test_gaussian_process import wall
 
-from lardhm_torch.baselines import local_gp
-from lardhm_torch.baselines.gaussian_process import condition, predict, squared_exponential
-from lardhm_torch.baselines.local_gp import LocalGP
+from lardhm_torch.evaluation.baselines import local_gp
+from lardhm_torch.evaluation.baselines.gaussian_process import (
+    condition,
+    predict,
+    squared_exponential,
+)
+from lardhm_torch.evaluation.baselines.local_gp import LocalGP
 
 F64 = torch.float64
 

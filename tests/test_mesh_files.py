@@ -4,7 +4,7 @@ import torch
 import trimesh
 
 from lardhm_torch import LardHilbertMap, extract_mesh, load_scans, sample_rays
-from lardhm_torch.mesh_files import save_mesh
+from lardhm_torch.io.mesh_files import save_mesh
 
 
 def some_ball(has_colors: bool = True) -> trimesh.Trimesh:

@@ -6,11 +6,12 @@ import torch
 import trimesh
 from torch import nn
 
-from lardhm_torch import LardHilbertMap, meshing, ridge, sample_rays, simulate_room, split_rays
-from lardhm_torch.meshing import extract_mesh
-from lardhm_torch.metrics import mesh_metrics
-from lardhm_torch.ridge import mean_with_neighbors, mesh_on_ridge
+from lardhm_torch import LardHilbertMap, sample_rays, simulate_room, split_rays
+from lardhm_torch.evaluation.mesh_distances import mesh_metrics
 from lardhm_torch.simulation import room_mesh
+from lardhm_torch.surfaces import meshing, ridge
+from lardhm_torch.surfaces.meshing import extract_mesh
+from lardhm_torch.surfaces.ridge import mean_with_neighbors, mesh_on_ridge
 
 
 class GaussianMap(nn.Module):

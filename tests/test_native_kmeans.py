@@ -11,7 +11,7 @@ from native_maps import (
 )
 
 from lardhm_torch import native
-from lardhm_torch.clustering import mini_batch_kmeans, z_order
+from lardhm_torch.learning.clustering import mini_batch_kmeans, z_order
 
 
 @dtypes

@@ -5,9 +5,10 @@ import torch
 from native_maps import dims, dtypes
 from small_maps import F64, wall, wall_map
 
-from lardhm_torch import LardHilbertMap, native, rays
+from lardhm_torch import LardHilbertMap, native
 from lardhm_torch.features import Kernel
-from lardhm_torch.rays import raycast
+from lardhm_torch.queries import raycasting
+from lardhm_torch.queries.raycasting import raycast
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="no compiler for the kernel")
 
@@ -62,7 +63,7 @@ def assert_same_ranges(native_ranges, plain_ranges, atol):
 
 @dims
 @dtypes
-@pytest.mark.parametrize("surface", rays.SURFACES)
+@pytest.mark.parametrize("surface", raycasting.SURFACES)
 @pytest.mark.parametrize("threshold", [0.3, 0.5, 0.8])
 def test_the_native_march_ends_where_the_definition_does(dim, dtype, surface, threshold):
     for seed, neighbors in ((0, 1), (1, 7), (2, 1000)):
@@ -74,7 +75,7 @@ def test_the_native_march_ends_where_the_definition_does(dim, dtype, surface, th
         assert_same_ranges(ours, plain, 1e-6 if dtype == F64 else 2e-3)
 
 
-@pytest.mark.parametrize("surface", rays.SURFACES)
+@pytest.mark.parametrize("surface", raycasting.SURFACES)
 def test_a_threshold_that_unknown_space_exceeds_stops_every_ray_at_once(surface):
     model = random_map(2)
     origins, directions = random_rays(200, 2)
@@ -103,7 +104,7 @@ def test_a_range_that_is_no_multiple_of_the_step_is_looked_at_to_its_end():
     start = torch.tensor([0.0, 1.0, 1.0], dtype=F64)
     full = float(raycast(PlainMap.of(model), start, ahead, 5.0, step=0.02))
     for most in torch.linspace(full - 0.2, full + 0.6, 23).tolist():
-        for surface in rays.SURFACES:
+        for surface in raycasting.SURFACES:
             asked = (start, ahead, most, 0.5, 0.3)
             plain = raycast(PlainMap.of(model), *asked, surface=surface)
             torch.testing.assert_close(raycast(model, *asked, surface=surface), plain)

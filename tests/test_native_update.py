@@ -5,17 +5,22 @@ import torch
 from native_maps import dims, dtypes, kernel, make_map, make_points, true_distances
 
 from lardhm_torch import native
-from lardhm_torch.clustering import Clusters, along_curve, cluster_points, factor_covariances
 from lardhm_torch.features import kernel_factors, raw_factors
-from lardhm_torch.map_state import MapState
-from lardhm_torch.merging import pool_into
-from lardhm_torch.native.update import (
+from lardhm_torch.learning.assignment import (
     explain,
     ordered_features,
     possibly_inside,
     reaching,
     unexplained,
 )
+from lardhm_torch.learning.cluster_matching import pool_into
+from lardhm_torch.learning.clustering import (
+    Clusters,
+    along_curve,
+    cluster_points,
+    factor_covariances,
+)
+from lardhm_torch.learning.parameters import MapState
 
 both_paths = pytest.mark.parametrize("native_path", [True, False])
 

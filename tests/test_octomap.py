@@ -3,8 +3,8 @@ import sys
 import pytest
 import torch
 
-from lardhm_torch.baselines.octomap import OctoMapBaseline
-from lardhm_torch.metrics import evaluate
+from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
+from lardhm_torch.evaluation.held_out import evaluate
 from lardhm_torch.scans import Scans, split_rays
 
 UTM = torch.tensor([5e5, 4.5e6, 100.0], dtype=torch.float64)

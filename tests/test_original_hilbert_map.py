@@ -2,7 +2,7 @@ import pytest
 import torch
 from test_gaussian_process import wall
 
-from lardhm_torch.baselines.original_hilbert_map import (
+from lardhm_torch.evaluation.baselines.original_hilbert_map import (
     REACH,
     KernelApproximationMap,
     OriginalHilbertMap,

@@ -12,7 +12,7 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
 from lardhm_torch import LardHilbertMap, sample_rays, save_scans, simulate_room
-from lardhm_torch.metrics import evaluate
+from lardhm_torch.evaluation.held_out import evaluate
 
 ROOT = Path(__file__).parents[1]
 

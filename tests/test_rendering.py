@@ -5,7 +5,7 @@ import trimesh
 from matplotlib.image import imread
 from torch import nn
 
-from lardhm_torch.rendering import render_mesh, render_slice
+from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
 SIZE = (120, 90)
 

@@ -20,8 +20,8 @@ from lardhm_torch import (
     simulate_room,
     stream_scans,
 )
-from lardhm_torch.checkpoint import save_state
 from lardhm_torch.cli import main
+from lardhm_torch.io.map_files import save_state
 from lardhm_torch.streaming import Progress, real_time
 
 STREAM = Path(__file__).parents[1] / "scripts" / "stream.py"
@@ -91,7 +91,7 @@ def test_a_stream_that_stopped_goes_on_to_the_very_same_map(folder, whole, tmp_p
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(folder, tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(
-        "lardhm_torch.checkpoint.save_state",
+        "lardhm_torch.io.map_files.save_state",
         lambda state, path: saved.append(state["_stream"]["scans"]) or save_state(state, path),
     )
     config = StreamConfig(checkpoint_every=4)
@@ -109,7 +109,7 @@ def test_fit_incremental_shows_the_map_after_every_scan(folder, tmp_path, monkey
         def close(self):
             shown.append("closed")
 
-    monkeypatch.setattr("lardhm_torch.viewer.LiveView", Page)
+    monkeypatch.setattr("lardhm_torch.viewing.viewer.LiveView", Page)
     path = tmp_path / "map.pt"
     assert main(["fit", str(folder), "-o", str(path), "--incremental", "--view"]) == 0
     assert len(shown) == 10
@@ -156,7 +156,7 @@ def test_a_stream_with_a_radius_forgets_what_is_far_from_the_sensor():
 
 
 def test_the_real_time_setting_learns_the_same_room_with_fewer_points(folder, whole):
-    from lardhm_torch.metrics import evaluate
+    from lardhm_torch.evaluation.held_out import evaluate
 
     model = LardHilbertMap()
     stream_scans(model, iter_scans(folder), real_time())

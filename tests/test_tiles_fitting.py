@@ -14,8 +14,15 @@ import pytest
 import torch
 from room_tiles import CONFIG, contents, room_folder, room_pieces
 
-from lardhm_torch import FitConfig, LardHilbertMap, Scans, load_scans, sample_rays, split_rays
-from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch import (
+    FitConfig,
+    LardHilbertMap,
+    Scans,
+    load_scans,
+    sample_rays,
+    split_rays,
+)
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.tiles import fitting
 from lardhm_torch.tiles.cluster_files import clusters_path
 from lardhm_torch.tiles.fitting import fit_tiles

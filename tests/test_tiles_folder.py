@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from tiled_maps import F64, border_points, random_map, tiled
 
 from lardhm_torch import LardHilbertMap, TiledMap, cli, save_scans, simulate_room
-from lardhm_torch.checkpoint import load_state
 from lardhm_torch.cli import main
+from lardhm_torch.io.map_files import load_state
 from lardhm_torch.tiles import grouping
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.grouping import rows_by_number

@@ -118,7 +118,7 @@ def test_the_verbs_make_a_map_of_tiles_and_add_to_it(tmp_path, files, capsys):
 
 
 def room_manifest(folder, files):
-    from lardhm_torch.io import iter_pieces
+    from lardhm_torch.io.scan_files import iter_pieces
 
     tile_scans(iter_pieces(files), folder, CONFIG)
     return read_manifest(folder)

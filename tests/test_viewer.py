@@ -10,8 +10,9 @@ import trimesh
 from chromium import chromium, chromium_path
 from scipy.spatial import cKDTree
 
-from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, scene, simulate_room
-from lardhm_torch.viewer import LiveView, MapViewer, ViewConfig
+from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, simulate_room
+from lardhm_torch.viewing import scene
+from lardhm_torch.viewing.viewer import LiveView, MapViewer, ViewConfig
 
 PATIENCE = 120_000  # [ms] a shared machine draws in software
 

@@ -17,8 +17,8 @@ def query(arguments: argparse.Namespace) -> None:
     import numpy as np
     import torch
 
-    from lardhm_torch.files import replaced_file
-    from lardhm_torch.io import load_points
+    from lardhm_torch.io.atomic_files import replaced_file
+    from lardhm_torch.io.scan_files import load_points
     from lardhm_torch.tiles.tiled_map import open_map
 
     model = open_map(arguments.map)
@@ -35,7 +35,7 @@ def query(arguments: argparse.Namespace) -> None:
 def mesh(arguments: argparse.Namespace) -> None:
     """A map to a surface."""
     from lardhm_torch import extract_mesh
-    from lardhm_torch.mesh_files import save_mesh
+    from lardhm_torch.io.mesh_files import save_mesh
     from lardhm_torch.tiles.tiled_map import open_map
 
     surface = extract_mesh(
@@ -52,7 +52,7 @@ def mesh(arguments: argparse.Namespace) -> None:
 
 def grid(arguments: argparse.Namespace) -> None:
     """A map to a grid of probabilities: .npz, or OctoMap's .bt and .ot."""
-    from lardhm_torch.exporting import save_grid
+    from lardhm_torch.io.grid_files import save_grid
     from lardhm_torch.tiles.tiled_map import open_map
 
     model = open_map(arguments.map)
@@ -65,7 +65,7 @@ def view(arguments: argparse.Namespace) -> None:
     import threading
 
     from lardhm_torch.tiles.tiled_map import open_map
-    from lardhm_torch.viewer import MapViewer, ViewConfig
+    from lardhm_torch.viewing.viewer import MapViewer, ViewConfig
 
     model = open_map(arguments.map)
     scans = read_scans(arguments, model.dim) if arguments.scans else None
@@ -87,8 +87,8 @@ def view(arguments: argparse.Namespace) -> None:
 def render(arguments: argparse.Namespace) -> None:
     """A map to a picture, without a screen."""
     from lardhm_torch import extract_mesh
-    from lardhm_torch.rendering import render_mesh, render_slice
     from lardhm_torch.tiles.tiled_map import open_map
+    from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
     model = open_map(arguments.map)
     if arguments.slice is not None or model.dim == 2:
@@ -110,17 +110,17 @@ def render(arguments: argparse.Namespace) -> None:
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """A map against held-out rays."""
-    from lardhm_torch import metrics
-    from lardhm_torch.calibration import draw_reliability
+    from lardhm_torch.evaluation import held_out, scores
+    from lardhm_torch.evaluation.calibration import draw_reliability
     from lardhm_torch.tiles.tiled_map import open_map
 
     model = open_map(arguments.map)
     scans = read_scans(arguments, model.dim)
-    answers = metrics.answer_held_out(model, scans, seed=arguments.seed)
-    table = metrics.score_held_out(answers)
+    answers = held_out.answer_held_out(model, scans, seed=arguments.seed)
+    table = held_out.score_held_out(answers)
     if arguments.reliability:
-        draw_reliability(metrics.reliability_held_out(answers), arguments.reliability)
-    print(json.dumps(table, indent=2) if arguments.json else metrics.format_metrics(table))
+        draw_reliability(held_out.reliability_held_out(answers), arguments.reliability)
+    print(json.dumps(table, indent=2) if arguments.json else scores.format_metrics(table))
 
 
 def info(arguments: argparse.Namespace) -> None:
@@ -135,7 +135,7 @@ def info(arguments: argparse.Namespace) -> None:
 
 def _info_of_file(path: str) -> dict[str, Any]:
     from lardhm_torch import LardHilbertMap
-    from lardhm_torch.querying import map_bounds
+    from lardhm_torch.queries.grids import map_bounds
 
     model = LardHilbertMap.load(path)
     occupied = int(model.is_occupied.sum())

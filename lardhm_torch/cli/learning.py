@@ -33,7 +33,7 @@ def split(arguments: argparse.Namespace) -> None:
 def fit(arguments: argparse.Namespace) -> None:
     """Scans to a map."""
     from lardhm_torch import LardHilbertMap, fine_tune, sample_rays
-    from lardhm_torch.checkpoint import load_state, save_state
+    from lardhm_torch.io.map_files import load_state, save_state
 
     if arguments.incremental:
         _fit_incrementally(arguments)
@@ -94,7 +94,7 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         model = LardHilbertMap(first.dim, **settings)
     live = None
     if arguments.view:
-        from lardhm_torch.viewer import LiveView
+        from lardhm_torch.viewing.viewer import LiveView
 
         live = LiveView()
     try:

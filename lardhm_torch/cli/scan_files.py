@@ -29,7 +29,7 @@ def iter_scans_of(arguments: argparse.Namespace, dim: int | None = None) -> Iter
 
 def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Iterator[Scans]:
     """The same in pieces of bounded size, for scans larger than memory."""
-    from lardhm_torch.io import iter_pieces
+    from lardhm_torch.io.scan_files import iter_pieces
 
     for piece in iter_pieces(arguments.scans, **_reading(arguments)):
         yield _with_dim(piece, arguments, dim)
@@ -37,7 +37,7 @@ def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Ite
 
 def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
     """How the files are to be read."""
-    from lardhm_torch.io import Camera
+    from lardhm_torch.io.scan_files import Camera
 
     return {
         "origin": arguments.origin,

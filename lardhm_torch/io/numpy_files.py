@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from lardhm_torch.files import replaced_file
+from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.readout import Readout, whole_numbers
 
 _DEFLATE_RATIO = 1032  # no deflate stream expands further

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lardhm_torch.clustering import Clusters
-from lardhm_torch.files import replaced_file
+from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.tiles.places import Index, tile_name
 from lardhm_torch.tiles.training import TileClusters
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lardhm_torch.surface import thickness_counts
+from lardhm_torch.queries.raycasting import thickness_counts
 from lardhm_torch.tiles.reach import largest_reach
 
 MOST_BINS = 1 << 12  # of thickness, on either side of a meter: up to 2^256 m

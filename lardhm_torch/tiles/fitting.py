@@ -22,10 +22,10 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lardhm_torch.files import remove_partials, replaced_file
-from lardhm_torch.fitting import FitConfig
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.map_state import MapState, write_state
+from lardhm_torch.io.atomic_files import remove_partials, replaced_file
+from lardhm_torch.learning.fitting import FitConfig
+from lardhm_torch.learning.parameters import MapState, write_state
 from lardhm_torch.tiles.cluster_files import (
     clustered_points,
     clusters_path,

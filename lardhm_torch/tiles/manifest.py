@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lardhm_torch.files import replaced_file
+from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.tiles.entries import (
     Tile,
     check_number,

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lardhm_torch.fitting import FitConfig
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.sampling import SamplingConfig, sample_rays, usable_rays
 from lardhm_torch.scans import Scans
 from lardhm_torch.tiles.cutting import Grid, grid_origin, route
@@ -68,7 +68,7 @@ def tile_scans(
     cut, and so that any two folders with one edge and one world frame can be joined.
 
     Args:
-        pieces: scans in pieces that fit in memory (`lardhm_torch.io.iter_pieces`).
+        pieces: scans in pieces that fit in memory (`lardhm_torch.io.scan_files.iter_pieces`).
         folder: is made; must not hold a tiled map that is complete.
         config: edge, halo, seed, sampling.
         progress: show a bar with the rate on a terminal.

@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lardhm_torch.clustering import points_where
-from lardhm_torch.files import replaced_file
+from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.learning.clustering import points_where
 from lardhm_torch.tiles.places import Index, samples_path, tile_index, tile_name
 
 FORMAT_VERSION = 1

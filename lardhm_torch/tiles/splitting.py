@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.map_state import OF_THE_WHOLE
+from lardhm_torch.learning.parameters import OF_THE_WHOLE
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest
 from lardhm_torch.tiles.places import tile_indices, tile_path

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.map_state import OF_THE_WHOLE
+from lardhm_torch.learning.parameters import OF_THE_WHOLE
 from lardhm_torch.tiles.entries import Tile
 from lardhm_torch.tiles.manifest import Manifest
 from lardhm_torch.tiles.places import Index, tile_name, tile_path

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch import uncertainty
 from lardhm_torch.hilbert_map import LardHilbertMap, check_axes, check_points
+from lardhm_torch.learning import posterior
 from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number
 from lardhm_torch.tiles.manifest import Manifest, read_manifest
 from lardhm_torch.tiles.parts import Parts
@@ -137,9 +137,7 @@ class TiledMap:
 
     def variance(self, points: Tensor) -> Tensor:
         """As `LardHilbertMap.variance`; the tiles' posteriors must be there."""
-        return self._ask(
-            points, lambda model, part: model.variance(part), uncertainty.PRIOR_VARIANCE
-        )
+        return self._ask(points, lambda model, part: model.variance(part), posterior.PRIOR_VARIANCE)
 
     def bayesian_probability(self, points: Tensor) -> Tensor:
         """As `LardHilbertMap.bayesian_probability`; the tiles' posteriors must be there."""

@@ -19,7 +19,9 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.clustering import (
+from lardhm_torch.features import Kernel, raw_factors
+from lardhm_torch.learning.assignment import ordered_features
+from lardhm_torch.learning.clustering import (
     MIN_COUNT,
     POINTS_PER_CLUSTER,
     Clusters,
@@ -28,9 +30,7 @@ from lardhm_torch.clustering import (
     concatenate_clusters,
     factor_covariances,
 )
-from lardhm_torch.features import Kernel, raw_factors
-from lardhm_torch.fitting import FitConfig, class_factors, deal_samples, fit_weights
-from lardhm_torch.native.update import ordered_features
+from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
 from lardhm_torch.tiles.samples import OCCUPIED, Counts, TilePoints
 
 # Clusters of best accuracy lie denser where points do, but less so: where there are twice the

@@ -18,10 +18,10 @@ from lardhm_torch import (
     sample_rays,
     split_rays,
 )
-from lardhm_torch.baselines.local_gp import LocalGP
-from lardhm_torch.baselines.octomap import OctoMapBaseline
-from lardhm_torch.baselines.original_hilbert_map import OriginalHilbertMap
-from lardhm_torch.metrics import evaluate, protocol_rays
+from lardhm_torch.evaluation.baselines.local_gp import LocalGP
+from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
+from lardhm_torch.evaluation.baselines.original_hilbert_map import OriginalHilbertMap
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 
 Model = Callable[[Tensor], Tensor]
 Build = Callable[[Scans, Samples], Model]

@@ -15,9 +15,9 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from lardhm_torch import LardHilbertMap, Samples, sample_rays, split_rays
-from lardhm_torch.metrics import evaluate, protocol_rays
-from lardhm_torch.querying import grid, map_bounds
-from lardhm_torch.uncertainty import PRIOR_VARIANCE
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
+from lardhm_torch.learning.posterior import PRIOR_VARIANCE
+from lardhm_torch.queries.grids import grid, map_bounds
 
 SETS = (
     "paper_virtual",

@@ -15,11 +15,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import LardHilbertMap, sample_rays, split_rays
-from lardhm_torch.baselines.gaussian_process import condition
-from lardhm_torch.baselines.gp_implicit_surface import GPImplicitSurface
-from lardhm_torch.baselines.gp_occupancy_map import GPOccupancyMap
-from lardhm_torch.baselines.local_gp import LocalGP
-from lardhm_torch.baselines.original_hilbert_map import KernelApproximationMap
+from lardhm_torch.evaluation.baselines.gaussian_process import condition
+from lardhm_torch.evaluation.baselines.gp_implicit_surface import GPImplicitSurface
+from lardhm_torch.evaluation.baselines.gp_occupancy_map import GPOccupancyMap
+from lardhm_torch.evaluation.baselines.local_gp import LocalGP
+from lardhm_torch.evaluation.baselines.original_hilbert_map import KernelApproximationMap
 
 SIZES = (250, 500, 1000, 2000, 4000)
 TEST_RAYS = 2000

@@ -18,10 +18,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import LardHilbertMap, extract_mesh, load_scans, sample_rays
-from lardhm_torch.baselines.local_gp import LocalGP
-from lardhm_torch.baselines.octomap import OctoMapBaseline
-from lardhm_torch.baselines.original_hilbert_map import OriginalHilbertMap
-from lardhm_torch.rendering import render_mesh
+from lardhm_torch.evaluation.baselines.local_gp import LocalGP
+from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
+from lardhm_torch.evaluation.baselines.original_hilbert_map import OriginalHilbertMap
+from lardhm_torch.viewing.rendering import render_mesh
 
 CEILING = 1.7  # [m] faces above it are left out, to look into the room
 ROOM_VIEW: dict[str, Any] = {"azimuth": -60, "elevation": 50, "size": (800, 600)}

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
 from lardhm_torch import LardHilbertMap
-from lardhm_torch.querying import query_slice
+from lardhm_torch.queries.grids import query_slice
 
 NUM_CLUSTERS = 28
 MARGIN, RESOLUTION = 0.2, 0.01  # [m]

@@ -21,17 +21,17 @@ from lardhm_torch import (
     native,
     sample_rays,
 )
-from lardhm_torch.baselines.local_gp import LocalGP
-from lardhm_torch.baselines.octomap import OctoMapBaseline, to_array
-from lardhm_torch.baselines.original_hilbert_map import OriginalHilbertMap
-from lardhm_torch.clustering import (
+from lardhm_torch.evaluation.baselines.local_gp import LocalGP
+from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline, to_array
+from lardhm_torch.evaluation.baselines.original_hilbert_map import OriginalHilbertMap
+from lardhm_torch.features import raw_factors
+from lardhm_torch.learning.clustering import (
     along_curve,
     clusters_about,
     factor_covariances,
     mini_batch_kmeans,
 )
-from lardhm_torch.features import raw_factors
-from lardhm_torch.fitting import deal_samples, fit_weights
+from lardhm_torch.learning.fitting import deal_samples, fit_weights
 
 NUM_CLUSTERS, NUM_NEIGHBORS, RESOLUTION = 500, 5, 0.05
 NUM_POINTS, NUM_QUERIES = 82_842, 638_683

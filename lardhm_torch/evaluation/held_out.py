@@ -1,0 +1,128 @@
+"""Evaluate a map on held-out rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lardhm_torch.evaluation.calibration import reliability
+from lardhm_torch.evaluation.scores import both_classes, occupancy_metrics
+from lardhm_torch.scans import Scans
+
+MIN_RANGE, MAX_RANGE = 0.3, 60.0  # [m] rays outside are not test rays
+NEAR_START, NEAR_END = 0.6, 0.2  # [m] before the hit: where the near points lie
+FREE_KINDS = ("unif", "near", "paper")
+PAPER_SHARE = 0.95  # of a ray: where the paper's own free test points lie
+QUERY_POINTS = 1 << 20  # points asked at a time
+
+
+class HeldOut(NamedTuple):
+    """Test points of R rays, world frame, each (R, D) float64 [m].
+
+    ``hits`` are occupied, all others free: ``unif`` uniform from the sensor to 0.2 m before the
+    hit, ``near`` between 0.6 m and 0.2 m before it, ``paper`` uniform over 95 % of the ray, with
+    no margin (the paper's own kind of test).
+    """
+
+    hits: Tensor
+    unif: Tensor
+    near: Tensor
+    paper: Tensor
+
+
+def protocol_rays(scans: Scans, max_rays: int | None = None, seed: int = 0) -> Scans:
+    """The rays that train and test: returns, first of their pulse, 0.3 m < range < 60 m.
+
+    Args:
+        scans: range scans.
+        max_rays: a random subset of this size where there are more; None: all.
+        seed: of the subset.
+    """
+    ranges = scans.ranges
+    usable = (ranges > MIN_RANGE) & (ranges < MAX_RANGE) & scans.is_return
+    scans = scans.select(usable & (scans.target_index == 1))
+    if max_rays is None or len(scans) <= max_rays:
+        return scans
+    rng = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(len(scans), generator=rng)[:max_rays].sort().values
+    return scans.select(chosen.to(scans.ends.device))
+
+
+def held_out_points(scans: Scans, seed: int = 0) -> HeldOut:
+    """Test points of every usable ray: its hit and three free points before it.
+
+    Raises:
+        ValueError: no ray is usable (see `protocol_rays`).
+    """
+    rays = protocol_rays(scans)
+    if len(rays) == 0:
+        raise ValueError(
+            f"scans must hold at least one ray that hit, with {MIN_RANGE} m < range < "
+            f"{MAX_RANGE:g} m; got none of {len(scans)}"
+        )
+    ranges, origins = rays.ranges[:, None], rays.ray_origins
+    directions = (rays.ends - origins) / ranges
+    rng = torch.Generator(device=ranges.device).manual_seed(seed)
+
+    def uniform(start: Tensor, end: Tensor) -> Tensor:
+        share = torch.rand(ranges.shape, generator=rng, device=ranges.device, dtype=ranges.dtype)
+        return origins + (start + share * (end - start)) * directions
+
+    zero, margin = torch.zeros_like(ranges), ranges - NEAR_END
+    return HeldOut(
+        hits=rays.ends,
+        unif=uniform(zero, margin),
+        near=uniform((ranges - NEAR_START).clamp(min=0), margin),
+        paper=uniform(zero, PAPER_SHARE * ranges),
+    )
+
+
+@torch.no_grad()
+def answer_held_out(model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0) -> HeldOut:
+    """Probabilities of a map at the test points of held-out rays, each (R,).
+
+    Args:
+        model: (N, D) world positions -> (N,) probability of occupancy.
+        scans: rays that the map has not seen.
+        seed: of the test points.
+
+    Raises:
+        ValueError: no ray is usable, or the model answers with anything but (N,) probabilities.
+    """
+
+    def ask(positions: Tensor) -> Tensor:
+        answers = [model(chunk) for chunk in positions.split(QUERY_POINTS)]
+        if sum(len(answer) for answer in answers) != len(positions):
+            raise ValueError(
+                f"model must answer ({len(positions)},), one probability per point; "
+                f"got {[tuple(answer.shape) for answer in answers]}"
+            )
+        return torch.cat(answers)
+
+    return HeldOut(*map(ask, held_out_points(scans, seed)))
+
+
+def score_held_out(answers: HeldOut) -> dict[str, dict[str, float]]:
+    """Scores for each kind of free point: unif, near, paper."""
+    return {kind: occupancy_metrics(answers.hits, getattr(answers, kind)) for kind in FREE_KINDS}
+
+
+def reliability_held_out(answers: HeldOut) -> dict[str, Tensor]:
+    """Reliability diagram for each kind of free point, both classes of the same mass."""
+    return {
+        kind: reliability(*both_classes(answers.hits, getattr(answers, kind)))
+        for kind in FREE_KINDS
+    }
+
+
+def evaluate(
+    model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0
+) -> dict[str, dict[str, float]]:
+    """Scores of a map on held-out rays, for each kind of free point: unif, near, paper.
+
+    Arguments and errors are those of `answer_held_out`.
+    """
+    return score_held_out(answer_held_out(model, scans, seed))

@@ -1,0 +1,127 @@
+"""Maps to grids that other programs read: NumPy arrays and OctoMap trees."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lardhm_torch.evaluation.baselines.octomap import new_tree, to_array
+from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.queries.grids import (
+    BLOCK_POINTS,
+    EVIDENCE,
+    cluster_boxes,
+    grid_axes,
+    map_bounds,
+    query_grid,
+)
+from lardhm_torch.surfaces.meshing import BLOCK_CELLS, active_blocks
+
+GRID_SUFFIXES = (".bt", ".npz", ".ot")
+_TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
+
+
+def save_grid(
+    model: Any,
+    path: str | os.PathLike[str],
+    resolution: float = 0.1,
+    bounds: tuple[Any, Any] | None = None,
+) -> int:
+    """Write the map as a grid of cells, in the format of the extension; the number of cells.
+
+    Cells lie at whole multiples of the resolution.
+
+    | extension | content |
+    |---|---|
+    | ``.npz`` | ``probability`` (nx, ny, nz) float32 at the centers, ``lower`` (D,), ``resolution`` |
+    | ``.bt`` | OctoMap: occupied and free cells, the rest unknown |
+    | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511) |
+
+    An OctoMap cell has the highest log-odds of the centers of its eight parts, since surfaces are
+    thinner than cells and OctoMap too lets occupied win. It is known where they are 1 or more away
+    from 0 (probability 0.27, 0.73).
+
+    Args:
+        model: a map; for OctoMap a 3-D one.
+        path: a file that ends in .npz, .bt or .ot; an old one is replaced at the end.
+        resolution: edge of a cell [m].
+        bounds: lower and upper corner of the part to write, world frame [m]; left out: all of it.
+
+    Raises:
+        ValueError: the extension is another, the map is empty or has the wrong dimension, or the
+            map lies outside what an OctoMap of this resolution spans.
+        ImportError: an OctoMap is asked for and octomap-python is not installed.
+        FileNotFoundError: the folder of path does not exist.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in GRID_SUFFIXES:
+        known = ", ".join(GRID_SUFFIXES)
+        raise ValueError(f"path must end in one of {known} for a grid; got {Path(path).name!r}")
+    lower, upper = map_bounds(model) if bounds is None else bounds
+    lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in (lower, upper))
+    grid_axes(lower, upper, resolution)  # raises for what is no resolution and no corners
+    first, last = (lower / resolution).floor(), (upper / resolution).ceil() - 1
+    first_center, last_center = ((end + 0.5) * resolution for end in (first, last.maximum(first)))
+    if suffix == ".npz":
+        probability = query_grid(model, first_center, last_center, resolution)
+        with replaced_file(path) as partial, open(partial, "wb") as file:
+            np.savez(
+                file,
+                probability=probability.float().cpu().numpy(),
+                lower=(first * resolution).numpy(),
+                resolution=np.float64(resolution),
+            )
+        return probability.numel()
+    tree, count = _octomap_of(model, first_center, last_center, resolution)
+    with replaced_file(path) as partial:
+        write = tree.writeBinary if suffix == ".bt" else tree.write
+        if not write(os.fsencode(partial)):
+            raise OSError(f"{path} cannot be written")
+    return count
+
+
+def _octomap_of(model: Any, first: Tensor, last: Tensor, resolution: float) -> tuple[Any, int]:
+    """An OctoMap tree of the known cells between two centers, and their number."""
+    if model.dim != 3:
+        raise ValueError(f"an OctoMap needs a 3-D map; got {model.dim}-D. Use .npz")
+    reach = float(torch.cat([first, last]).abs().max())
+    if reach > _TREE_CELLS * resolution:
+        raise ValueError(
+            f"an OctoMap of {resolution} m cells spans {_TREE_CELLS * resolution:.0f} m on either "
+            f"side of zero; the map reaches {reach:.0f} m. Use a larger resolution, or subtract "
+            "model.origin from the scans"
+        )
+    tree, count = new_tree(resolution), 0
+    for centers, log_odds in _known_cells(model, first, last, resolution):
+        for center, value in zip(to_array(centers), log_odds.tolist(), strict=True):
+            tree.updateNode(center, value, True)
+        count += len(centers)
+    tree.updateInnerOccupancy()
+    return tree, count
+
+
+@torch.no_grad()
+def _known_cells(
+    model: Any, first: Tensor, last: Tensor, resolution: float
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Centers (n, 3) and log-odds (n,) of the known cells, some blocks that hold clusters a time."""
+    lower, upper = (box.cpu() for box in cluster_boxes(model))
+    cells = ((last - first) / resolution).round().long() + 1
+    corner = first - 0.5 * resolution
+    touching = ((upper >= corner) & (lower <= last + 0.5 * resolution)).all(dim=1)
+    lower, upper = (((box[touching] - corner) / resolution).clamp(min=0) for box in (lower, upper))
+    local = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
+    parts = (torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 3) * resolution).double()
+    for blocks in active_blocks(lower, upper, cells).split(BLOCK_POINTS // (8 * len(local))):
+        index = (blocks[:, None] * BLOCK_CELLS + local).reshape(-1, 3)
+        centers = first + resolution * index[(index < cells).all(dim=1)].double()
+        points = (centers[:, None] + parts).to(model.origin.device)
+        log_odds = model.log_odds(points).float().amax(dim=1).cpu()
+        known = log_odds.abs() >= EVIDENCE
+        yield centers[known], log_odds[known]

@@ -1,0 +1,195 @@
+"""Whole maps moved, cut and joined: loop closures, constant memory, several robots."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.features import Kernel, raw_factors
+from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
+from lardhm_torch.learning.clustering import concatenate_clusters, factor_covariances, pool_clusters
+from lardhm_torch.learning.fitting import FitConfig
+from lardhm_torch.learning.parameters import MapState, read_state, write_state
+from lardhm_torch.learning.replay import Evidence, join_evidence, learn, recalled_evidence
+
+ZETA = 1.0  # [m] clusters of two maps that are farther apart never match (Algorithm 2)
+RECALLED = 16  # points drawn from each cluster to see whether two maps contradict each other
+TOLERANCE = 0.01  # of a probability: what the joined map may differ from a map it was made of
+
+
+def moved(
+    state: MapState, origin: Tensor, rotation: Tensor, translation: Tensor
+) -> tuple[MapState, Tensor]:
+    """Clusters and origin after x -> rotation x + translation in the world frame.
+
+    Means become R z + t and covariances R S R^T, exactly: no probability changes but where it is.
+
+    Args:
+        state: M clusters.
+        origin: (D,) float64, world = map + origin [m].
+        rotation: (D, D) orthonormal, determinant 1.
+        translation: (D,) [m].
+
+    Raises:
+        ValueError: a shape is wrong, a value is not finite, or rotation is not a rotation.
+    """
+    dim = len(origin)
+    rotation = torch.as_tensor(rotation, dtype=torch.float64, device=origin.device)
+    translation = torch.as_tensor(translation, dtype=torch.float64, device=origin.device)
+    if rotation.shape != (dim, dim) or translation.shape != (dim,):
+        raise ValueError(
+            f"rotation must be ({dim}, {dim}) and translation ({dim},); "
+            f"got {tuple(rotation.shape)} and {tuple(translation.shape)}"
+        )
+    if not bool(translation.isfinite().all()):
+        raise ValueError(f"translation must be finite; got {translation.tolist()}")
+    eye = torch.eye(dim, dtype=torch.float64, device=origin.device)
+    error = float((rotation @ rotation.T - eye).abs().max())
+    if not (error < 1e-5 and torch.linalg.det(rotation) > 0):
+        raise ValueError(
+            "rotation must be orthonormal with determinant 1; "
+            f"R R^T differs from the identity by {error:.2g}, "
+            f"the determinant is {float(torch.linalg.det(rotation)):.4g}"
+        )
+    place = rotation @ origin + translation
+    new_origin = place.round()  # whole meters, as in `fit`
+    shift = place - new_origin
+
+    def turned(points: Tensor) -> Tensor:
+        return (points.double() @ rotation.T + shift).to(points.dtype)
+
+    scatters = rotation @ state.scatters.double() @ rotation.T
+    after = replace(
+        state,
+        centers=turned(state.centers),
+        raw_scale_tril=_turned_factors(state.raw_scale_tril, rotation),
+        means=turned(state.means),
+        scatters=scatters.to(state.scatters.dtype),
+    )
+    return after, new_origin
+
+
+def _turned_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
+    """Raw factors of R L L^T R^T: the triangle of the QR decomposition of (R L)^T."""
+    diagonal = raw_scale_tril.double().diagonal(dim1=-2, dim2=-1).exp()
+    factors = raw_scale_tril.double().tril(-1) + torch.diag_embed(diagonal)
+    upper = torch.linalg.qr((rotation @ factors).mT, mode="r").R
+    signs = upper.diagonal(dim1=-2, dim2=-1).sign()
+    return raw_factors((signs[..., None] * upper).mT).to(raw_scale_tril.dtype)
+
+
+def within(state: MapState, center: Tensor, radius: float) -> MapState:
+    """The clusters whose centers are at most ``radius`` [m] from a point of the map frame."""
+    return state.rows(torch.linalg.vector_norm(state.centers - center, dim=1) <= radius)
+
+
+def merge_maps(first: Any, second: Any, *, seed: int = 0) -> Any:
+    """One map of two, in the frame of the first; both stay as they are.
+
+    Clusters that match by Algorithm 2 are pooled, with weights and centers averaged by the number
+    of points behind them; all others are taken over. Where the joined map then answers otherwise
+    than the maps it was made of, its weights are trained on what both recall, each counting by its
+    points. Maps that do not overlap are put side by side unchanged, and a map merged with itself
+    answers as before.
+
+    Args:
+        first: a `LardHilbertMap`.
+        second: another with the same settings; its points are in the same world frame (see
+            `LardHilbertMap.transform`).
+        seed: of the recalled points and the training.
+
+    Raises:
+        ValueError: the settings differ.
+
+    Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, between maps.
+    """
+    if first.settings != second.settings:
+        raise ValueError(
+            f"both maps must have the same settings; got {first.settings} and {second.settings}"
+        )
+    joined = copy.deepcopy(first)
+    if len(second) == 0:
+        return joined
+    ours, theirs = read_state(first), read_state(second)
+    if len(first) == 0:
+        joined.origin = second.origin.clone()
+        write_state(joined, MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True))))
+        return joined
+    shift = (second.origin - first.origin).to(ours.means)
+    theirs = MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True)))
+    theirs = replace(theirs, centers=theirs.centers + shift, means=theirs.means + shift)
+    rng = torch.Generator(device=shift.device).manual_seed(seed)
+    write_state(
+        joined, _settled(_pooled(ours, theirs, first.kernel), ours, theirs, first.kernel, rng)
+    )
+    return joined
+
+
+def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
+    """Matching clusters pooled, the others of both side by side.
+
+    Factors move by the change of the covariances with all points in the denominator: those of two
+    equal clusters are equal to that of their union.
+    """
+    floor = kernel.min_lengthscale
+    match = match_clusters(ours, theirs.clusters, theirs.is_occupied, ZETA, floor)
+    matched = match >= 0
+    where, groups = match[matched].unique(return_inverse=True)
+    before, others = ours.rows(where), theirs.rows(matched)
+    rows = torch.cat([torch.arange(len(where), device=groups.device), groups])
+    clusters = concatenate_clusters([before.clusters, others.clusters])
+    pooled = pool_clusters(clusters, rows, len(where))
+    share = clusters.counts / pooled.counts[rows]
+
+    def average(mine: Tensor, other: Tensor) -> Tensor:
+        values = torch.cat([mine, other])
+        shaped = share.to(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
+        return torch.zeros_like(mine).index_add_(0, rows, shaped * values)
+
+    spreads = [
+        factor_covariances(c.scatters / c.counts.clamp(min=1)[:, None, None], floor)
+        for c in (before.clusters, pooled)
+    ]
+    after = MapState(
+        average(before.weights, others.weights),
+        average(before.centers, others.centers),
+        moved_factors(before.raw_scale_tril, *spreads),
+        before.is_occupied,
+        pooled.counts,
+        pooled.means,
+        pooled.scatters,
+    )
+    rest = theirs.rows(~matched)
+    tail = MapState(*(torch.cat(pair) for pair in zip(after, rest, strict=True)))
+    return ours.put(where, tail)
+
+
+def _settled(
+    joined: MapState, ours: MapState, theirs: MapState, kernel: Kernel, rng: torch.Generator
+) -> MapState:
+    """The joined clusters with new weights wherever they contradict the maps they come from."""
+    evidence = join_evidence([_everything(state, kernel, rng) for state in (ours, theirs)])
+    tensors = (joined.centers, joined.raw_scale_tril, joined.weights, kernel)
+    index = native.build_index(joined.centers, kernel.num_neighbors)
+    probability = native.occupancy(evidence.points, *tensors, probability=True, index=index)
+    contested = (probability - evidence.labels).abs() > TOLERANCE
+    if not bool(contested.any()):
+        return joined
+    near = native.nearest_centers(
+        evidence.points[contested], joined.centers, kernel.num_neighbors, index
+    )
+    open_rows = torch.zeros_like(joined.is_occupied).index_fill_(0, near.reshape(-1), True)
+    learned = learn(joined, evidence, kernel, index, FitConfig(l2=0.01), rng)
+    return replace(joined, weights=torch.where(open_rows, learned, joined.weights))
+
+
+def _everything(state: MapState, kernel: Kernel, rng: torch.Generator) -> Evidence:
+    """What a whole map recalls, each cluster counting by its points."""
+    rows = torch.arange(len(state), device=state.weights.device)
+    strength = (state.counts / RECALLED).to(state.weights.dtype)[:, None].expand(-1, RECALLED)
+    return recalled_evidence(state, rows, kernel, strength, rng)

@@ -1,0 +1,69 @@
+import os
+import stat
+
+import pytest
+
+from lardhm_torch.io.atomic_files import replaced_file
+
+
+@pytest.fixture
+def path(tmp_path):
+    (tmp_path / "map.pt").write_bytes(b"old")
+    return tmp_path / "map.pt"
+
+
+def test_a_file_takes_its_name_at_the_end_of_the_block_and_whole(path):
+    with replaced_file(path) as partial:
+        partial.write_bytes(b"new")
+        assert path.read_bytes() == b"old"
+        assert partial.suffix == ".pt"
+    assert path.read_bytes() == b"new"
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_a_failure_leaves_the_old_file_and_nothing_else(path, error):
+    def write_half(partial):
+        partial.write_bytes(b"half")
+        raise error
+
+    with pytest.raises(type(error)), replaced_file(path) as partial:
+        write_half(partial)
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_two_writers_of_one_file_do_not_meet(path):
+    with replaced_file(path) as one, replaced_file(path) as other:
+        one.write_bytes(b"one")
+        other.write_bytes(b"other")
+    assert path.read_bytes() == b"one"  # the outer block ends last
+
+
+def test_who_may_read_the_file_follows_the_umask(path):
+    before = os.umask(0o027)
+    try:
+        with replaced_file(path):
+            pass
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
+def test_a_link_stays_a_link(path, tmp_path):
+    link = tmp_path / "link.pt"
+    link.symlink_to(path)
+    with replaced_file(link) as partial:
+        partial.write_bytes(b"new")
+    assert link.is_symlink()
+    assert path.read_bytes() == b"new"
+
+
+def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
+    with (
+        pytest.raises(FileNotFoundError, match=r"folder that exists.*nowhere"),
+        replaced_file(tmp_path / "nowhere/map.pt"),
+    ):
+        pass
+    with pytest.raises(IsADirectoryError, match="is a folder"), replaced_file(tmp_path):
+        pass

@@ -1,0 +1,131 @@
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from lardhm_torch import LardHilbertMap, grid, load_scans, sample_rays, simulate_room
+from lardhm_torch.io.grid_files import save_grid
+from lardhm_torch.queries.grids import EVIDENCE, map_bounds
+
+
+@pytest.fixture(scope="module")
+def room():
+    samples = sample_rays(simulate_room(num_rays=1500), seed=0)
+    return LardHilbertMap().fit(samples.points, samples.labels, 150)
+
+
+@pytest.fixture
+def octomap():
+    return pytest.importorskip("octomap", reason="octomap-python is not installed (extra octomap)")
+
+
+def cell_log_odds(model, centers, resolution):
+    """(n,) the highest log-odds at the centers of each cell's eight parts."""
+    parts = resolution * torch.cartesian_prod(*[torch.tensor([-0.25, 0.25]).double()] * 3)
+    with torch.no_grad():
+        return model.log_odds(torch.as_tensor(centers)[:, None] + parts).amax(dim=1).numpy()
+
+
+def read_tree(octomap, path):
+    """The leaf cells of a .bt or .ot file: centers (n, 3), edges (n,), occupied (n,), log-odds."""
+    tree = octomap.OcTree(0.1)
+    if path.suffix == ".bt":
+        tree.readBinary(str(path).encode())
+    else:
+        tree = octomap.OcTree.read(str(path).encode())
+    leaves = [
+        (leaf.getCoordinate(), leaf.getSize(), tree.isNodeOccupied(leaf), leaf.getValue())
+        for leaf in tree.begin_leafs()
+    ]
+    centers, edges, occupied, log_odds = zip(*leaves, strict=True)
+    return tree, np.array(centers), np.array(edges), np.array(occupied), np.array(log_odds)
+
+
+def test_cells_of_an_npz_hold_the_probability_at_their_centers(room, tmp_path):
+    count = save_grid(room, tmp_path / "grid.npz", 0.2)
+    with np.load(tmp_path / "grid.npz") as cells:
+        probability, lower, edge = cells["probability"], cells["lower"], float(cells["resolution"])
+    assert probability.dtype == np.float32
+    assert count == probability.size
+    assert np.allclose(lower / edge, np.rint(lower / edge))  # at whole multiples
+    index = np.stack(np.unravel_index(np.arange(0, probability.size, 997), probability.shape), 1)
+    with torch.no_grad():
+        expected = room(torch.as_tensor(lower + edge * (index + 0.5)))
+    assert np.allclose(probability[tuple(index.T)], expected, atol=1e-5)
+
+
+def test_bounds_cut_out_the_cells_they_touch(room, tmp_path):
+    save_grid(room, tmp_path / "grid.npz", 0.25, bounds=((0.3, -0.3, 1), (1.0, 0.3, 1)))
+    with np.load(tmp_path / "grid.npz") as cells:
+        assert cells["lower"].tolist() == [0.25, -0.5, 1]
+        assert cells["probability"].shape == (3, 4, 1)
+
+
+def test_a_flat_map_gives_a_flat_grid_and_no_octomap(tmp_path):
+    points = torch.rand(200, 2)
+    model = LardHilbertMap(2).fit(points, (points[:, 0] > 0.5).long(), 20)
+    save_grid(model, tmp_path / "grid.npz")
+    with np.load(tmp_path / "grid.npz") as cells:
+        assert cells["probability"].ndim == 2
+    with pytest.raises(ValueError, match=r"OctoMap needs a 3-D map; got 2-D\. Use \.npz"):
+        save_grid(model, tmp_path / "grid.bt")
+
+
+def test_octomap_gets_the_classes_of_known_cells_and_no_others(room, octomap, tmp_path):
+    count = save_grid(room, tmp_path / "map.bt", 0.4)
+    tree, centers, edges, occupied, _ = read_tree(octomap, tmp_path / "map.bt")
+    assert tree.getResolution() == 0.4
+    assert np.rint((edges / 0.4) ** 3).sum() == count  # pruned leaves hold several cells
+    log_odds = cell_log_odds(room, centers[edges < 0.5], 0.4)
+    assert (np.abs(log_odds) > EVIDENCE - 1e-3).all()
+    assert np.array_equal(log_odds > 0, occupied[edges < 0.5])
+    lower, upper = map_bounds(room)
+    everywhere = (grid(lower, upper, 0.4).reshape(-1, 3) / 0.4).floor() * 0.4 + 0.2
+    known = np.abs(cell_log_odds(room, everywhere, 0.4)) >= EVIDENCE
+    assert known.sum() == pytest.approx(count, rel=0.002)  # tails reach out of three deviations
+
+
+def test_octomap_full_trees_hold_the_clamped_log_odds(room, octomap, tmp_path):
+    save_grid(room, tmp_path / "map.ot", 0.4)
+    _, centers, edges, _, values = read_tree(octomap, tmp_path / "map.ot")
+    single = edges < 0.5
+    log_odds = cell_log_odds(room, centers[single], 0.4)
+    assert np.allclose(values[single], log_odds.clip(-2, 3.511), atol=1e-3)
+
+
+def test_a_map_of_real_scans_goes_to_octomap_and_back(data, octomap, tmp_path):
+    scans = load_scans(data / "la3dm_sim_structured/scans.npz")
+    samples = sample_rays(scans.select(torch.arange(0, len(scans), 5)), seed=0)
+    model = LardHilbertMap().fit(samples.points, samples.labels, 300)
+    save_grid(model, tmp_path / "map.bt", 0.2)
+    tree = octomap.OcTree(0.2)
+    tree.readBinary(str(tmp_path / "map.bt").encode())
+    places = torch.cat([scans.hits[::20], (scans.ends[::50] + scans.ray_origins[::50]) / 2])
+    log_odds = cell_log_odds(model, (places / 0.2).floor() * 0.2 + 0.1, 0.2)
+    expected = np.where(np.abs(log_odds) < EVIDENCE, -1, log_odds > 0)
+    assert np.array_equal(tree.getLabels(places.numpy()), expected)
+    assert {-1, 0, 1} == set(expected.tolist())
+
+
+def test_what_cannot_be_written_is_said_and_leaves_the_old_file(room, octomap, tmp_path):
+    (tmp_path / "map.bt").write_bytes(b"old")
+    with pytest.raises(
+        ValueError, match=r"end in one of \.bt, \.npz, \.ot for a grid; got 'map.x'"
+    ):
+        save_grid(room, tmp_path / "map.x")
+    with pytest.raises(ValueError, match="resolution must be > 0"):
+        save_grid(room, tmp_path / "map.bt", 0)
+    with pytest.raises(ValueError, match="it is empty"):
+        save_grid(LardHilbertMap(), tmp_path / "map.bt")
+    far = LardHilbertMap().fit(torch.rand(50, 3) + torch.tensor([5e5, 0, 0]), torch.ones(50))
+    with pytest.raises(ValueError, match=r"0\.1 m cells spans 3277 m .*reaches 50000\d m"):
+        save_grid(far, tmp_path / "map.bt", 0.1)
+    assert (tmp_path / "map.bt").read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["map.bt"]
+
+
+def test_without_octomap_the_error_names_the_extra(room, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "octomap", None)
+    with pytest.raises(ImportError, match=r"lardhm_torch\[octomap\]"):
+        save_grid(room, tmp_path / "map.bt")

@@ -1,0 +1,457 @@
+import copy
+
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from small_maps import same_map, wall, wall_map
+from test_clustering import cluster_moments
+
+from lardhm_torch import (
+    LardHilbertMap,
+    UpdateConfig,
+    load_scans,
+    resize_optimizer,
+    sample_rays,
+    split_rays,
+)
+from lardhm_torch.features import raw_factors
+from lardhm_torch.learning.cluster_matching import match_clusters, merge_clusters
+from lardhm_torch.learning.clustering import cluster_points, factor_covariances
+from lardhm_torch.learning.parameters import MapState
+from lardhm_torch.learning.replay import contradicted, forget, hit_clusters
+
+F64 = torch.float64
+PAPER = UpdateConfig(as_in_paper=True, replay=0)
+
+
+def state_of(clusters, is_occupied):
+    raw = raw_factors(factor_covariances(clusters.covariances, 0.01))
+    moments = (clusters.counts, clusters.means, clusters.scatters)
+    return MapState(clusters.means[:, 0] * 0, clusters.means, raw, is_occupied, *moments)
+
+
+# --- laws ---
+
+
+@pytest.mark.parametrize("config", [None, PAPER], ids=["default", "as in the paper"])
+def test_an_update_of_an_empty_map_is_a_fit(config):
+    updated = LardHilbertMap().update(*wall(), num_clusters=40, seed=3, config=config)
+    assert same_map(updated, LardHilbertMap().fit(*wall(), num_clusters=40, seed=3))
+
+
+@pytest.mark.parametrize("model", [LardHilbertMap(), wall_map()], ids=["empty", "fitted"])
+def test_an_update_with_no_points_is_the_identity(model):
+    before = copy.deepcopy(model)
+    assert model.update(torch.zeros(0, 3), torch.zeros(0)) is model
+    assert same_map(model, before)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**31 - 1))
+def test_points_that_are_explained_are_pooled_to_the_statistics_of_the_union(seed):
+    rng = torch.Generator().manual_seed(seed)
+    place = torch.arange(4.0, dtype=F64)[:, None] * torch.tensor([10.0, 0, 0], dtype=F64)
+    first, second = (
+        (place[:, None] + torch.rand(4, 50, 3, generator=rng, dtype=F64)).reshape(-1, 3)
+        for _ in range(2)
+    )
+    labels = torch.ones(200)
+    config = UpdateConfig(refine=1e9, radius=1e3, reach=1e3)
+    model = LardHilbertMap().double().fit(first, labels, num_clusters=4, seed=seed)
+    assume((model.counts == 50).all())  # one cluster for each place: whose a point is, is plain
+    model.update(first.clone(), labels, config=config).update(second, labels, config=config)
+    union = torch.cat([first, first, second]) - model.origin
+    owner = (union[:, None] - model.means[None]).square().sum(2).argmin(1)
+    expected = cluster_moments(union, owner, len(model))
+    torch.testing.assert_close(model.counts, expected.counts)
+    torch.testing.assert_close(model.means, expected.means)
+    torch.testing.assert_close(model.scatters, expected.scatters)
+    torch.testing.assert_close(model.centers, expected.means)
+    factors = raw_factors(factor_covariances(expected.covariances, model.min_lengthscale))
+    torch.testing.assert_close(model.raw_scale_tril, factors)
+
+
+def brute_force_match(known, new, is_occupied, zeta, floor):
+    """Algorithm 2, lines 2 to 13, loop by loop; of several matches the nearest."""
+
+    def stds(offset, covariance):
+        factor = factor_covariances(covariance[None], floor)[0]
+        return torch.linalg.vector_norm(torch.linalg.solve(factor, offset))
+
+    answer = []
+    for n in range(len(new)):
+        best, nearest = -1, float("inf")
+        for c in range(len(known)):
+            offset = new.means[n] - known.means[c]
+            distance = float(torch.linalg.vector_norm(offset))
+            inside = (
+                is_occupied[n] == known.is_occupied[c]
+                and distance < zeta
+                and stds(offset, known.clusters.covariances[c]) < 1
+                and stds(offset, new.covariances[n]) < 1
+            )
+            if inside and distance < nearest:
+                best, nearest = c, distance
+        answer.append(best)
+    return torch.tensor(answer)
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**31 - 1), zeta=st.sampled_from([0.05, 0.3, 5.0]))
+def test_matching_by_index_is_algorithm_2_loop_by_loop(seed, zeta):
+    rng = torch.Generator().manual_seed(seed)
+    points = torch.rand(900, 2, generator=rng, dtype=F64)
+    known = state_of(cluster_points(points, 25, rng), torch.rand(25, generator=rng) > 0.3)
+    new = cluster_points(torch.rand(500, 2, generator=rng, dtype=F64), 20, rng)
+    kinds = torch.rand(20, generator=rng) > 0.3
+    match = match_clusters(known, new, kinds, zeta, 0.01)
+    assert torch.equal(match, brute_force_match(known, new, kinds, zeta, 0.01))
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 2**31 - 1))
+def test_merging_disjoint_sets_does_not_depend_on_their_order(seed):
+    rng = torch.Generator().manual_seed(seed)
+    sets = [torch.rand(100, 3, generator=rng, dtype=F64) + 10 * shift for shift in range(3)]
+    parts = [cluster_points(points, 4, rng) for points in sets]
+    kinds = torch.ones(len(parts[1]), dtype=torch.bool)
+    start = state_of(parts[0], torch.ones(len(parts[0]), dtype=torch.bool))
+
+    def merge(*order):
+        state = start
+        for number in order:
+            part = parts[number]
+            state = merge_clusters(state, part, kinds[:1].expand(len(part)), 1.0, 0.01)
+        return state.rows(state.means[:, 0].argsort())
+
+    for ours, theirs in zip(merge(1, 2, 1), merge(1, 1, 2), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_a_cluster_merged_with_itself_doubles_its_count_and_keeps_its_place():
+    state = state_of(
+        cluster_points(wall()[0], 30, torch.Generator().manual_seed(0)),
+        torch.ones(30, dtype=torch.bool),
+    )
+    merged = merge_clusters(state, state.clusters, state.is_occupied, 1.0, 0.01)
+    assert torch.equal(merged.counts, 2 * state.counts)
+    torch.testing.assert_close(merged.means, state.means)
+    torch.testing.assert_close(merged.scatters, 2 * state.scatters)
+
+
+def test_occupied_and_free_never_merge():
+    points, labels = wall()
+    model = wall_map()
+    occupied = int(model.counts[model.is_occupied].sum())
+    model.update(points, 1 - labels, config=PAPER)  # the same place, every label reversed
+    old = model.is_occupied[: len(wall_map())]
+    assert torch.equal(old, wall_map().is_occupied)
+    assert int(model.counts[model.is_occupied].sum()) == occupied + int((1 - labels).sum())
+    assert int(model.counts[: len(old)].sum()) == int(wall_map().counts.sum())
+
+
+# --- a map that is used while it grows ---
+
+
+def test_what_a_tuned_cluster_learned_stays():
+    tuned, plain = wall_map(), wall_map()
+    rng = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        tuned.centers += 0.05 * torch.randn(tuned.centers.shape, generator=rng, dtype=F64)
+        tuned.raw_scale_tril += 0.1 * torch.eye(3, dtype=F64)  # the diagonal is a logarithm
+        tuned.raw_scale_tril += (torch.e**0.1 - 1) * tuned.raw_scale_tril.tril(-1)
+    offset = tuned.centers - plain.centers
+    for model in (tuned, plain):
+        model.update(*wall(seed=1), num_clusters=40, seed=1)
+    assert (plain.counts[: len(offset)] > wall_map().counts).double().mean() > 0.9
+    assert torch.equal(tuned.means, plain.means)
+    old = len(offset)
+    torch.testing.assert_close(tuned.centers[:old] - plain.centers[:old], offset)
+    torch.testing.assert_close(tuned.scale_tril[:old], torch.e**0.1 * plain.scale_tril[:old])
+
+
+def test_parameters_stay_the_same_objects_and_old_clusters_keep_their_rows():
+    model = wall_map()
+    parameters, occupied = list(model.parameters()), model.is_occupied.clone()
+    model.update(*wall(at=6.0), seed=1)
+    assert len(model) > len(occupied)
+    assert all(ours is theirs for ours, theirs in zip(model.parameters(), parameters, strict=True))
+    assert torch.equal(model.is_occupied[: len(occupied)], occupied)
+    torch.testing.assert_close(model.centers[: len(occupied)], wall_map().centers)
+
+
+def test_a_map_that_grows_keeps_a_reserve_that_no_file_and_no_copy_holds(tmp_path):
+    model = wall_map().update(*wall(at=6.0), num_clusters=40)
+    place, size = model.centers.data_ptr(), len(model)
+    assert model.centers.untyped_storage().nbytes() > model.centers.nbytes
+    model.update(*wall(60, at=12.0, seed=1), num_clusters=4)
+    assert len(model) > size
+    assert model.centers.data_ptr() == place  # it grew in its reserve
+    copied = copy.deepcopy(model).update(*wall(60, at=18.0), num_clusters=4)
+    assert copied.centers.data_ptr() != place
+    assert same_map(copied, copy.deepcopy(model).update(*wall(60, at=18.0), num_clusters=4))
+    model.save(tmp_path / "map.pt")
+    loaded = torch.load(tmp_path / "map.pt", weights_only=True)
+    tensors = [value for value in loaded.values() if isinstance(value, torch.Tensor)]
+    assert all(tensor.untyped_storage().nbytes() == tensor.nbytes for tensor in tensors)
+    assert same_map(LardHilbertMap.load(tmp_path / "map.pt"), model)
+
+
+def test_growth_leaves_alone_the_memory_behind_a_tensor_that_was_handed_in():
+    model, whole = wall_map(), torch.arange(10_000)
+    model.counts = whole[: len(model)]
+    model.update(*wall(at=6.0), num_clusters=40)
+    assert torch.equal(whole[len(wall_map()) :], torch.arange(10_000)[len(wall_map()) :])
+
+
+def test_plain_sgd_goes_on_after_growth_and_adam_fails_loudly_until_its_state_is_resized():
+    model = wall_map()
+    points, labels = wall(seed=2)
+
+    def step(optimizer):
+        optimizer.zero_grad()
+        loss = torch.nn.functional.binary_cross_entropy_with_logits
+        loss(model.log_odds(points), labels.double()).backward()
+        optimizer.step()
+
+    sgd, adam = (
+        kind(model.parameter_groups(), lr=0.1) for kind in (torch.optim.SGD, torch.optim.Adam)
+    )
+    step(adam)
+    momentum = adam.state[model.weights]["exp_avg"].clone()
+    model.update(*wall(at=6.0))
+    before = model.weights.detach().clone()
+    step(sgd)
+    assert not torch.equal(model.weights, before)
+    with pytest.raises(RuntimeError, match="size"):
+        step(adam)
+    resize_optimizer(adam, model)
+    resized = adam.state[model.weights]["exp_avg"]
+    assert torch.equal(resized[: len(momentum)], momentum)
+    assert not resized[len(momentum) :].any()
+    before = model.weights.detach().clone()
+    step(adam)
+    assert (model.weights != before).any()
+    model.crop(torch.tensor([6.0, 1.0, 1.0]), 2.0)
+    with pytest.raises(ValueError, match="Make a new optimizer after crop"):
+        resize_optimizer(adam, model)
+
+
+def test_weight_decay_moves_the_weights_alone():
+    model = wall_map()
+    model.requires_grad_(True)
+    before = copy.deepcopy(model)
+    optimizer = torch.optim.SGD(model.parameter_groups(weight_decay=0.5), lr=0.1)
+    (0 * model.log_odds(wall()[0]).sum()).backward()
+    optimizer.step()
+    torch.testing.assert_close(model.weights, before.weights * 0.95)
+    assert torch.equal(model.centers, before.centers)
+    assert torch.equal(model.raw_scale_tril, before.raw_scale_tril)
+
+
+@pytest.mark.parametrize("room", ["cluster_points", "learn"])
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
+def test_an_update_that_fails_or_is_interrupted_leaves_the_map_as_it_was(monkeypatch, room, error):
+    def fail(*_):
+        raise error
+
+    model = wall_map()
+    before = copy.deepcopy(model)
+    monkeypatch.setattr(f"lardhm_torch.learning.update.{room}", fail)
+    with pytest.raises(error):
+        model.update(*wall(at=6.0))
+    assert same_map(model, before)
+
+
+@pytest.mark.parametrize("at", [1.0, 6.0], ids=["no growth", "growth"])
+def test_an_interrupt_while_the_result_is_taken_over_leaves_the_map_as_it_was(monkeypatch, at):
+    from lardhm_torch.learning import parameters
+
+    model = wall_map()
+    before, assign = copy.deepcopy(model), parameters.assign_rows
+
+    def interrupted(target, where, part):
+        monkeypatch.setattr(parameters, "assign_rows", assign)
+        with torch.no_grad():
+            target.weights[where] = part.weights[: len(where)]
+            target.centers[len(before) :] = part.centers[len(where) :]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(parameters, "assign_rows", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.update(*wall(at=at, seed=1), seed=1)
+    assert same_map(model, before)
+
+
+@pytest.mark.parametrize(
+    ("points", "labels", "message"),
+    [
+        (torch.zeros(4, 2), torch.ones(4), r"points must be \(N, 3\); got \(4, 2\)"),
+        (torch.zeros(4, 3), torch.ones(3), r"labels must be \(4,\)"),
+        (torch.zeros(4, 3), -torch.ones(4), "labels must be 0 or 1; got -1"),
+        (torch.full((4, 3), float("nan")), torch.ones(4), "points must be finite"),
+    ],
+)
+def test_bad_samples_are_refused_and_the_map_is_as_it_was(points, labels, message):
+    model = wall_map()
+    before = copy.deepcopy(model)
+    with pytest.raises(ValueError, match=message):
+        model.update(points, labels)
+    with pytest.raises(ValueError, match="num_clusters must be 1 or more, or None; got 0"):
+        model.update(*wall(), num_clusters=0)
+    assert same_map(model, before)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"radius": 5.0}, "0 < radius <= reach; got 5.0 and 4.0"),
+        ({"zeta": 0.0}, "zeta, refine and memory must be > 0"),
+        ({"crowded": 1.0}, "crowded must be 2 or more; got 1.0"),
+        ({"max_points": 0}, "max_points must be 1 or more and replay 0 or more; got 0"),
+    ],
+)
+def test_settings_are_checked_when_made(settings, message):
+    with pytest.raises(ValueError, match=message):
+        UpdateConfig(**settings)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 5])
+@pytest.mark.parametrize("config", [None, PAPER], ids=["default", "as in the paper"])
+def test_maps_of_any_dimension_learn_a_second_wall(dim, config):
+    model = wall_map(dim).update(*wall(dim=dim, at=6.0), num_clusters=40, config=config)
+    for at in (1.0, 6.0):
+        points, labels = wall(dim=dim, seed=5, at=at)
+        assert ((model(points) > 0.5) == (labels > 0.5)).double().mean() > 0.95
+
+
+def test_one_new_point_and_one_new_class_are_enough_for_an_update():
+    model = wall_map()
+    model.update(torch.tensor([[50.0, 0.0, 0.0]]), torch.ones(1))
+    assert model(torch.tensor([50.0, 0.0, 0.0])).isfinite()
+    free = LardHilbertMap().fit(wall()[0][600:], torch.zeros(600), num_clusters=10)
+    free.update(wall()[0][:600], torch.ones(600), num_clusters=10)
+    assert (free(wall()[0][:600]) > 0.5).double().mean() > 0.95
+
+
+# --- what the map remembers ---
+
+
+def test_what_is_said_elsewhere_changes_nothing_here():
+    model = wall_map()
+    points = wall(seed=4)[0]
+    before = model(points).detach()
+    model.update(*wall(at=30.0), num_clusters=40)
+    torch.testing.assert_close(model(points).detach(), before, atol=1e-6, rtol=0)
+
+
+def test_new_points_beside_old_ones_do_not_destroy_what_was_known():
+    """The left half of a wall is seen again and again; the right half must not fade."""
+    model, (points, labels) = wall_map(), wall(seed=4)
+    right = points[:, 1] > 1.3
+    before = ((model(points) > 0.5) == (labels > 0.5))[right].double().mean()
+    for seed in range(10):
+        more, of_more = wall(seed=10 + seed)
+        model.update(more[more[:, 1] < 1.0], of_more[more[:, 1] < 1.0], seed=seed)
+    after = ((model(points) > 0.5) == (labels > 0.5))[right].double().mean()
+    assert after > before - 0.03
+
+
+def test_an_obstacle_that_rays_pass_through_fades_within_a_few_scans():
+    model = LardHilbertMap().fit(*wall(seed=0), num_clusters=40)
+    for seed in range(5):  # well known
+        model.update(*wall(seed=seed + 1), seed=seed)
+    beyond, labels = wall(seed=20, at=3.0)
+    rng = torch.Generator().manual_seed(0)
+    there = wall(seed=30)[0][:600]
+    assert (model(there) > 0.5).double().mean() > 0.95
+    scans = 0
+    while (model(there) > 0.5).double().mean() > 0.05:
+        assert scans < 10
+        open_space = torch.rand(6000, 3, generator=rng, dtype=F64) * 2
+        points = torch.cat([beyond[:600], open_space])
+        model.update(points, torch.cat([labels[:600], torch.zeros(6000)]), seed=scans)
+        scans += 1
+    assert scans >= 1
+    assert (model(beyond[:600]) > 0.5).double().mean() > 0.9
+
+
+def test_a_contradicted_cluster_forgets_most_of_its_past_and_keeps_its_shape():
+    points = wall()[0]
+    clusters = cluster_points(points[:600], 4, torch.Generator().manual_seed(0))
+    part = state_of(clusters, torch.ones(len(clusters), dtype=torch.bool))
+    worth = torch.full_like(part.weights, torch.inf)
+    worth[0] = 0.5
+    after = forget(part, worth, memory=80.0)
+    assert torch.equal(after.counts[1:], part.counts[1:])
+    assert after.counts[0] == 20
+    torch.testing.assert_close(after.clusters.covariances, part.clusters.covariances)
+
+
+def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
+    points = wall()[0]
+    rng = torch.Generator().manual_seed(0)
+    clusters = cluster_points(points[:600], 8, rng)
+    known = state_of(clusters, torch.arange(len(clusters)) % 2 > 0)
+    hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
+    passed = contradicted(known, hit_clusters(known, hits, 0.01), len(hits), free, 0.01)
+    assert torch.equal(passed.isfinite(), known.is_occupied)
+    met = hit_clusters(known, free, 0.01)
+    assert torch.equal(met, known.is_occupied)
+    assert not contradicted(known, met, len(free), free, 0.01).isfinite().any()
+    no_hits = hit_clusters(known, hits[:0], 0.01)
+    assert not contradicted(known, no_hits, 0, free, 0.01).isfinite().any()
+
+
+# --- real scans ---
+
+
+def streamed(train, config=None):
+    model = LardHilbertMap(dim=train.dim)
+    for number, scan in enumerate(train.scan_id.unique().tolist()):
+        samples = sample_rays(train.select(train.scan_id == scan), seed=number)
+        model.update(samples.points, samples.labels, seed=number, config=config)
+    return model
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["la3dm_sim_structured", "sevenscenes_rgbd"])
+def test_a_stream_predicts_held_out_rays_as_well_as_all_scans_at_once(data, name):
+    from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
+
+    train, test = split_rays(protocol_rays(load_scans(data / name / "scans.npz"), 40_000), 0.5)
+    samples = sample_rays(train)
+    model = streamed(train)
+    batch = LardHilbertMap().fit(samples.points, samples.labels, num_clusters=len(model))
+    ours, theirs = evaluate(model, test), evaluate(batch, test)
+    for kind, loss in (("unif", 0.01), ("near", 0.02)):
+        lost = theirs[kind]["balanced_accuracy"] - ours[kind]["balanced_accuracy"]
+        assert lost <= loss
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["paper_virtual", "balm_realworld"])
+def test_revisits_hardly_grow_the_map(data, name):
+    scans = load_scans(data / name / "scans.npz")
+    order = torch.randperm(len(scans), generator=torch.Generator().manual_seed(0))
+    sizes, model = [], LardHilbertMap()
+    for number, rays in enumerate(order[:44_000].chunk(11)):  # the same place, other rays
+        samples = sample_rays(scans.select(rays), seed=number)
+        sizes.append(len(model.update(samples.points, samples.labels, seed=number)))
+    assert sizes[1] <= 1.05 * sizes[0]
+    assert sizes[10] <= 1.10 * sizes[0]
+
+
+def test_scans_that_each_see_a_little_more_make_finer_clusters():
+    """A robot that comes nearer sees a wall with a few more points each time, never with many more."""
+
+    def clusters_after(config):
+        model, rng = LardHilbertMap(), torch.Generator().manual_seed(0)
+        for turn in range(18):
+            wall = torch.rand(int(200 * 1.2**turn), 3, generator=rng, dtype=torch.float64)
+            points = wall * torch.tensor([8.0, 8.0, 0.02])
+            model.update(points, torch.ones(len(points)), seed=turn, config=config)
+        return len(model)
+
+    assert clusters_after(UpdateConfig()) > 3 * clusters_after(UpdateConfig(crowded=1e9))
