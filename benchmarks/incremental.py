@@ -37,7 +37,8 @@ from lardhm_torch import (
 )
 from lardhm_torch.evaluation.baselines.octomap import new_tree, to_array
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
-from lardhm_torch.learning.clustering import along_curve, cluster_each, split_classes
+from lardhm_torch.learning.clustering import cluster_each, split_classes
+from lardhm_torch.points import in_morton_order
 from lardhm_torch.streaming import real_time
 
 SETS = (
@@ -73,7 +74,7 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
     model = LardHilbertMap()
     origin = samples.points.mean(dim=0).round()
     local = (samples.points - origin).float()
-    local, labels = along_curve(local, samples.labels)
+    local, labels = in_morton_order(local, samples.labels)
     clusters = cluster_each(split_classes(local, labels > 0.5), (occupied, free), rng)
     model._grow(*clusters, origin)
     model._train_weights(local, labels, FitConfig(), rng, False)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap
-from lardhm_torch.learning.clustering import z_order
+from lardhm_torch.points import morton_order
 
 AREA_PER_CLUSTER = 0.25  # [m^2] of ground
 AREA_PER_POINT = 0.005  # [m^2]
@@ -35,7 +35,7 @@ def made_up_map(num_clusters: int, num_neighbors: int = 5, seed: int = 0) -> Lar
     centers = hills(AREA_PER_CLUSTER * num_clusters / 2, num_clusters, rng)
     is_occupied = torch.arange(num_clusters) % 2 > 0
     centers[:, 2] += torch.where(is_occupied, 0, 3 * torch.rand(num_clusters, generator=rng))
-    order = z_order(centers)  # as `fit` leaves them
+    order = morton_order(centers)  # as `fit` leaves them
     centers, is_occupied = centers[order], is_occupied[order]
     model = LardHilbertMap(dim=3, num_neighbors=num_neighbors)
     state = model.state_dict()

@@ -35,13 +35,10 @@ from timing import Contender, compare, format_comparison, format_rows
 from workers import plain_path
 
 from lardhm_torch import FitConfig, LardHilbertMap, native
-from lardhm_torch.learning.clustering import (
-    along_curve,
-    clusters_about,
-    factor_covariances,
-    mini_batch_kmeans,
-)
+from lardhm_torch.learning.clustering import clusters_about, mini_batch_kmeans
 from lardhm_torch.learning.fitting import deal_samples, fit_weights
+from lardhm_torch.learning.map_state import factor_covariances
+from lardhm_torch.points import in_morton_order
 
 # Table I and II of the paper [ms]: 8 cores of 2.5 GHz, 500 clusters.
 PAPER_STAGES = {
@@ -165,7 +162,7 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
 
     def kmeans() -> list[torch.Tensor]:
         rng = torch.Generator().manual_seed(0)
-        return [mini_batch_kmeans(*along_curve(points), half, rng) for points in classes]
+        return [mini_batch_kmeans(*in_morton_order(points), half, rng) for points in classes]
 
     centers = kmeans()
 
@@ -175,7 +172,7 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
             factor_covariances(clusters.covariances, model.min_lengthscale)
 
     config, rng = FitConfig(), torch.Generator().manual_seed(0)
-    samples = along_curve(task.points - model.origin.float(), task.labels)
+    samples = in_morton_order(task.points - model.origin.float(), task.labels)
     local, labels = deal_samples(samples, config.rows_a_batch(len(task.points)), rng)
     state = (model.centers, model.raw_scale_tril, model.kernel)
     index = native.build_index(model.centers, model.num_neighbors)
@@ -206,7 +203,7 @@ def kmeans(arguments: argparse.Namespace) -> Result:
     half = NUM_CLUSTERS // 2
 
     def ours() -> torch.Tensor:
-        return mini_batch_kmeans(*along_curve(points), half, torch.Generator().manual_seed(0))
+        return mini_batch_kmeans(*in_morton_order(points), half, torch.Generator().manual_seed(0))
 
     def theirs() -> Any:
         return sklearn_kmeans(points.numpy(), half)

@@ -21,7 +21,8 @@ from conditions import conditions
 
 from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
-from lardhm_torch.learning.parameters import MapState, assign_state
+from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.parameters import assign_state
 
 EDGE = 20.0  # [m] of a tile
 SIDE = (32, 32)  # tiles of ground, the first 1000 of them

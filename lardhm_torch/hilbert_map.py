@@ -1,4 +1,4 @@
-"""The map: a torch module that owns the clusters and their weights."""
+"""The map: a torch module that answers queries and learns from labelled points."""
 
 from __future__ import annotations
 
@@ -7,38 +7,35 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
+from lardhm_torch.features import Kernel, feature_matrix, lard_kernel
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import map_merging, parameters, posterior
-from lardhm_torch.learning.clustering import (
-    Clusters,
-    along_curve,
-    cluster_classes,
-    factor_covariances,
-)
-from lardhm_torch.learning.fitting import FitConfig, deal_samples, fit_weights
+from lardhm_torch.learning.clustering import check_num_clusters
+from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
-from lardhm_torch.sampling import check_samples
+from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame, training_points
+from lardhm_torch.sampling import seeded_generator
 
-FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
 
-
-class LardHilbertMap(nn.Module):
+class LardHilbertMap(parameters.MapParameters):
     """Continuous occupancy: a weighted sum of local kernel features gives the log-odds.
 
-    An empty map, and any place far from every cluster, says nothing: probability exactly 1/2.
-    Points are given in the world frame; ``origin`` is subtracted in float64 before they are cast to
-    the map's dtype, so that coordinates may be far from zero. A point with a NaN or infinite
-    coordinate has probability NaN.
+    An empty map, and any place far from every cluster, has probability exactly 1/2. Points are
+    given in the world frame; ``origin`` is subtracted in float64 before they are cast to the map's
+    dtype, so coordinates may be far from zero. A point with a NaN or infinite coordinate has
+    probability NaN. Tensors, NumPy arrays and lists are accepted as points.
 
     Args:
         dim: number of coordinates D.
-        num_neighbors: k nearest clusters that answer for a point.
-        covariance_scale: factor on the clusters' covariances.
-        min_lengthscale: no kernel axis is thinner [m], before ``covariance_scale``.
+        num_neighbors: k, the number of nearest clusters used per query point.
+        covariance_scale: factor on the covariances of the clusters.
+        min_lengthscale: smallest standard deviation of a kernel along any axis [m], before
+            ``covariance_scale``.
+        device: where the tensors are; None: torch's default.
+        dtype: floating point type of the tensors; None: torch's default.
 
     Attributes:
         weights: (M,) parameter, learned.
@@ -46,87 +43,15 @@ class LardHilbertMap(nn.Module):
         raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with the logarithm of their
             diagonals: any value is a valid factor. `scale_tril` is the kernel's.
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters.
-        posterior_means, posterior_variances: (M,) buffers, the weights as `fit_uncertainty` knows
-            them; variance 0 for clusters that it has not seen.
+        posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; variance
+            0 for clusters that it has not seen.
         posterior_scales: (2,) buffer, factors on negative and on positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
     """
 
-    weights: nn.Parameter
-    centers: nn.Parameter
-    raw_scale_tril: nn.Parameter
-    is_occupied: Tensor
-    counts: Tensor
-    means: Tensor
-    scatters: Tensor
-    posterior_means: Tensor
-    posterior_variances: Tensor
-    posterior_scales: Tensor
-    origin: Tensor
-
-    def __init__(
-        self,
-        dim: int = 3,
-        num_neighbors: int = 16,
-        *,
-        covariance_scale: float = 4.0,
-        min_lengthscale: float = 0.01,
-    ) -> None:
-        super().__init__()
-        for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
-        if not covariance_scale > 0 or not min_lengthscale > 0:
-            raise ValueError(
-                "covariance_scale and min_lengthscale must be > 0; "
-                f"got {covariance_scale} and {min_lengthscale}"
-            )
-        self.dim = dim
-        self.num_neighbors = num_neighbors
-        self.covariance_scale = float(covariance_scale)
-        self.min_lengthscale = float(min_lengthscale)
-        self.weights = nn.Parameter(torch.zeros(0))
-        self.centers = nn.Parameter(torch.zeros(0, dim), requires_grad=False)
-        self.raw_scale_tril = nn.Parameter(torch.zeros(0, dim, dim), requires_grad=False)
-        self.register_buffer("is_occupied", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("counts", torch.zeros(0, dtype=torch.long))
-        self.register_buffer("means", torch.zeros(0, dim))
-        self.register_buffer("scatters", torch.zeros(0, dim, dim))
-        self.register_buffer("posterior_means", torch.zeros(0))
-        self.register_buffer("posterior_variances", torch.zeros(0))
-        self.register_buffer("posterior_scales", torch.ones(2))
-        self.register_load_state_dict_pre_hook(posterior.fill_missing)
-        self.register_buffer("origin", torch.zeros(dim, dtype=torch.float64))
-        self._index = torch.empty(0, dtype=torch.uint8)
-        self._reserves: dict[str, tuple[int, int]] = {}  # of `parameters.resize`
-        self.register_load_state_dict_pre_hook(parameters.make_room)
-
-    # --- what the map knows ---
-
-    def __len__(self) -> int:
-        """Number of clusters M."""
-        return len(self.weights)
-
-    @property
-    def scale_tril(self) -> Tensor:
-        """(M, D, D) lower Cholesky factors of the kernels [m]: covariance scale and floor included."""
-        return kernel_factors(self.raw_scale_tril, self.kernel)
-
-    @property
-    def kernel(self) -> Kernel:
-        """Number of neighbors, covariance scale and floor of the kernels."""
-        return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
-
-    def extra_repr(self) -> str:
-        """What `print(model)` shows."""
-        return (
-            f"dim={self.dim}, num_clusters={len(self)}, num_neighbors={self.num_neighbors}, "
-            f"covariance_scale={self.covariance_scale}, min_lengthscale={self.min_lengthscale}"
-        )
-
-    # --- what the map answers ---
+    # --- queries ---
 
     def forward(self, points: Tensor) -> Tensor:
         """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
@@ -140,7 +65,7 @@ class LardHilbertMap(nn.Module):
         """(N, D) world positions [m] -> sparse COO (N, M), K kernel values a row, eq. (9)."""
         local = self._to_map_frame(points)
         if local.ndim != 2:
-            raise ValueError(f"points must be (N, {self.dim}); got {tuple(points.shape)}")
+            raise ValueError(f"points must be (N, {self.dim}); got {tuple(local.shape)}")
         indices = native.nearest_centers(
             local, self.centers, self.num_neighbors, self._fresh_index()
         )
@@ -156,13 +81,62 @@ class LardHilbertMap(nn.Module):
         return self._posterior(points)[1]
 
     def bayesian_probability(self, points: Tensor) -> Tensor:
-        """(..., D) world positions [m] -> (...) probability of occupancy, unsure where weights are.
+        """(..., D) world positions [m] -> (...) probability that accounts for the weights' variance.
 
         Raises:
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
         mean, variance = self._posterior(points)
         return posterior.moderate(mean, posterior.OWN_SHARE * variance)
+
+    @torch.no_grad()
+    def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
+        """Probability, or log-odds, at all points of a lattice: faster than point by point.
+
+        Args:
+            axes: D lists of world coordinates [m]; all their combinations are the points.
+            probability: False: log-odds.
+
+        Returns:
+            (len(axes[0]), len(axes[1]), ...) without gradient.
+
+        Raises:
+            ValueError: axes are not D lists of finite coordinates.
+        """
+        check_axes(axes, self.dim)
+        local = [
+            to_map_frame(axis, shift, self.centers.dtype)
+            for axis, shift in zip(axes, self.origin, strict=True)
+        ]
+        return native.lattice_occupancy(
+            local, *self._tensors(), probability=probability, index=self._fresh_index()
+        )
+
+    @torch.no_grad()
+    def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
+        """`raycasting.raycast` by the native kernel; None where it does not support this map.
+
+        Args:
+            origins: (R, D) world positions, float64 [m].
+            directions: (R, D) of length 1, float64.
+            march: as for `native.raycast`.
+        """
+        if len(self) == 0 or not native.supports(self.centers):
+            return None
+        rays = (origins - self.origin, directions)
+        tensors = (self.centers, self.raw_scale_tril, self.weights)
+        return native.raycast(rays, march, tensors, self.kernel, self._fresh_index())
+
+    def _query(self, points: Tensor, probability: bool) -> Tensor:
+        local = self._to_map_frame(points)
+        flat = local.reshape(-1, self.dim)
+        answer = native.occupancy(
+            flat, *self._tensors(), probability=probability, index=self._fresh_index()
+        )
+        return answer.reshape(local.shape[:-1])
+
+    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
+        return self.centers, self.raw_scale_tril, self.weights, self.kernel
 
     def _posterior(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the log-odds at (..., D) points."""
@@ -172,14 +146,11 @@ class LardHilbertMap(nn.Module):
                 "call fit_uncertainty(points, labels) first, and again after update"
             )
         local = self._to_map_frame(points)
-        parts = []
-        for chunk in local.reshape(-1, self.dim).split(posterior.QUERY_CHUNK):
-            indices, values = self._nearest_features(chunk)
-            mean = (values * self.posterior_means[indices]).sum(dim=1)
-            mean = posterior.posterior_log_odds(mean, self.posterior_scales)
-            variance = posterior.latent_variance(indices, values, self.posterior_variances)
-            parts.append(torch.stack([mean, variance]))
-        mean, variance = torch.cat(parts, dim=1).reshape(2, *local.shape[:-1])
+        own = (self.posterior_means, self.posterior_variances, self.posterior_scales)
+        answer = posterior.predict(
+            self._nearest_features, local.reshape(-1, self.dim), posterior.Posterior(*own)
+        )
+        mean, variance = (values.reshape(local.shape[:-1]) for values in answer)
         return mean, variance
 
     def _nearest_features(self, local: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,52 +159,8 @@ class LardHilbertMap(nn.Module):
             local, centers, raw_scale_tril, self.kernel, self._fresh_index()
         )
 
-    def _query(self, points: Tensor, probability: bool) -> Tensor:
-        local = self._to_map_frame(points)
-        state = (self.centers, self.raw_scale_tril, self.weights, self.kernel)
-        flat = local.reshape(-1, self.dim)
-        answer = native.occupancy(flat, *state, probability=probability, index=self._fresh_index())
-        return answer.reshape(local.shape[:-1])
-
-    @torch.no_grad()
-    def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """Probability, or log-odds, at all points of a lattice: faster than the points one by one.
-
-        Args:
-            axes: D lists of world coordinates [m]; all their combinations are the points.
-            probability: False: log-odds.
-
-        Returns:
-            (len(axes[0]), len(axes[1]), ...) without gradient.
-        """
-        check_axes(axes, self.dim)
-        local = [
-            to_frame(axis, shift, self.centers.dtype)
-            for axis, shift in zip(axes, self.origin, strict=True)
-        ]
-        state = (self.centers, self.raw_scale_tril, self.weights, self.kernel)
-        return native.lattice_occupancy(
-            local, *state, probability=probability, index=self._fresh_index()
-        )
-
-    @torch.no_grad()
-    def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
-        """`rays.raycast` by the native kernel; None where that does not answer for this map.
-
-        Args:
-            origins: (R, D) world positions, float64 [m].
-            directions: (R, D) of length 1, float64.
-            march: as for `native.raycast`.
-        """
-        if len(self) == 0 or not native.supports(self.centers):
-            return None
-        parameters = (self.centers, self.raw_scale_tril, self.weights)
-        return native.raycast(
-            (origins - self.origin, directions), march, parameters, self.kernel, self._fresh_index()
-        )
-
     def _fresh_index(self) -> Tensor:
-        """The neighbor search's index, made anew whenever the centers are not those it was made of."""
+        """The index of the neighbor search, rebuilt whenever the centers have changed."""
         if torch.compiler.is_compiling():  # no branch on values; the operators check it themselves
             return self._index
         if not native.index_matches(self._index, self.centers, self.num_neighbors):
@@ -242,11 +169,11 @@ class LardHilbertMap(nn.Module):
         return self._index
 
     def _to_map_frame(self, points: Tensor) -> Tensor:
-        points = torch.as_tensor(points, device=self.origin.device)
+        points = as_tensor(points, self.origin.device)
         check_points(points, self.dim)
-        return to_frame(points, self.origin, self.centers.dtype)
+        return to_map_frame(points, self.origin, self.centers.dtype)
 
-    # --- how the map learns ---
+    # --- learning ---
 
     def fit(
         self,
@@ -260,47 +187,43 @@ class LardHilbertMap(nn.Module):
     ) -> LardHilbertMap:
         """Learn the map from labelled points; what it knew before is forgotten.
 
-        Each class is clustered on its own, the clusters' moments give centers and length-scales,
-        then the weights are trained. If anything fails, the map is as it was.
+        Each class is clustered on its own, the moments of the clusters give centers and
+        length-scales, then the weights are trained. If anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free; one class alone is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
-                leaves the rest to the other, and no cluster is starved of points. None: chosen
-                from the data (`clustering.choose_num_clusters`).
-            seed: of clustering and training.
+                leaves the rest to the other. None: chosen from the data
+                (`clustering.choose_num_clusters`).
+            seed: random seed of clustering and training.
             config: how the weights are trained.
-            progress: show a bar on a terminal.
+            progress: show a progress bar on a terminal.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points.
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points, or
+                num_clusters is not a positive integer.
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
-        points, labels = check_samples(points, labels, self.dim, self.origin.device)
-        _check_num_clusters(num_clusters)
-        dtype = self.centers.dtype
-        rng = torch.Generator(device=points.device).manual_seed(seed)
-        origin = points.mean(dim=0, dtype=torch.float64).round()
-        local, labels = along_curve(to_frame(points, origin, dtype), labels.to(dtype))
-        clusters, is_occupied = cluster_classes(local, labels, num_clusters, rng)
-        learned = LardHilbertMap(**self.settings).to(self.centers)
-        learned._grow(clusters, is_occupied, origin)
-        learned._train_weights(local, labels, config or FitConfig(), rng, progress)
-        self.load_state_dict(learned.state_dict())
+        samples = training_points(points, labels, self.centers)
+        check_num_clusters(num_clusters)
+        rng = seeded_generator(seed, "fit", self.centers.device)
+        task = FitTask(self.kernel, config or FitConfig(), rng, progress)
+        state = fit_clusters(samples.points, samples.labels, num_clusters, task)
+        parameters.write_state(self, state, samples.origin)
         return self
 
     @torch.no_grad()
     def fit_uncertainty(self, points: Tensor, labels: Tensor) -> LardHilbertMap:
-        """Learn how sure the weights are; `variance` and `bayesian_probability` then answer.
+        """Estimate the variance of the weights, for `variance` and `bayesian_probability`.
 
-        The map's own probability and log-odds stay as they are, and as fast. Call it after the
-        last `fit`, `fine_tune` or `update`, with the points the map was made from: the posterior
-        belongs to the weights it was made for.
+        Probability and log-odds stay as they are, and as fast. Call it after the last `fit`,
+        `fine_tune` or `update`, with the points the map was trained on: the posterior belongs to
+        the weights it was computed for.
 
         Args:
             points: (N, D) world positions [m].
@@ -314,13 +237,9 @@ class LardHilbertMap(nn.Module):
         """
         if len(self) == 0:
             raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
-        points, labels = check_samples(points, labels, self.dim, self.origin.device)
-        indices, values = self._nearest_features(self._to_map_frame(points))
-        log_odds = (values * self.weights[indices]).sum(dim=1)
-        variances = posterior.weight_variances(indices, values, log_odds, len(self))
-        samples = (indices, values, log_odds, labels.to(values.dtype))
-        self.posterior_scales = posterior.posterior_scales(*samples, variances)
-        self.posterior_means, self.posterior_variances = self.weights.detach().clone(), variances
+        local, labels, _ = training_points(points, labels, self.centers, self.origin)
+        found = posterior.fit_posterior(*self._nearest_features(local), self.weights, labels)
+        self.posterior_means, self.posterior_variances, self.posterior_scales = found
         return self
 
     def update(
@@ -334,24 +253,25 @@ class LardHilbertMap(nn.Module):
     ) -> LardHilbertMap:
         """Learn from one more scan and keep what is known; on an empty map the same as `fit`.
 
-        New points join the clusters that explain them, the others make new ones; then the weights
-        near the scan are trained on the new points and on what the map recalls. Parameters stay
-        the same objects (see `parameters.resize_optimizer` for an optimizer with a state). If
-        anything fails, the map is as it was.
+        New points join the clusters that explain them, the others form new ones; then the weights
+        near the scan are trained on the new points and on pseudo-samples drawn from the clusters.
+        Parameters stay the same objects (see `parameters.resize_optimizer` for an optimizer with a
+        state). If anything fails, the map is unchanged.
 
         Args:
-            points: (N, D) world positions [m]; none leave the map as it is.
+            points: (N, D) world positions [m]; an empty set leaves the map unchanged.
             labels: (N,) 1 occupied, 0 free.
-            num_clusters: total over both classes if the map knew nothing yet; points that are
-                explained already make none. None: chosen from the data.
-            seed: of clustering and training.
+            num_clusters: total over both classes if nothing were known yet; points that existing
+                clusters explain form no new ones. None: chosen from the data.
+            seed: random seed of clustering and training.
             config: `UpdateConfig(as_in_paper=True, replay=0)` is the paper's own rule.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1.
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, or num_clusters is
+                not a positive integer.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
@@ -359,20 +279,18 @@ class LardHilbertMap(nn.Module):
             return self
         if len(self) == 0:
             return self.fit(points, labels, num_clusters, seed=seed)
-        points, labels = check_samples(points, labels, self.dim, self.origin.device)
-        _check_num_clusters(num_clusters)
-        rng = torch.Generator(device=points.device).manual_seed(seed)
+        samples = training_points(points, labels, self.centers, self.origin)
+        check_num_clusters(num_clusters)
+        rng = seeded_generator(seed, "update", self.centers.device)
         task = Task(self.kernel, config or UpdateConfig(), rng)
-        local = self._to_map_frame(points)
-        state = parameters.read_state(self)
-        changes = updated(state, local, labels.to(local.dtype), num_clusters, task)
+        changes = updated(parameters.read_state(self), *samples[:2], num_clusters, task)
         parameters.write_rows(self, *changes)
         return self
 
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
-        """Move the map: what was said of x is now said of rotation x + translation.
+        """Move the map rigidly: what it said of x, it then says of rotation x + translation.
 
-        Exact, without training: a loop closure moves a submap to where it belongs.
+        Exact, without training: after a loop closure a submap can be moved to its new pose.
 
         Args:
             rotation: (D, D) orthonormal, determinant 1.
@@ -384,15 +302,12 @@ class LardHilbertMap(nn.Module):
         Raises:
             ValueError: wrong shapes, or rotation is not a rotation.
         """
-        state, origin = map_merging.moved(
-            parameters.read_state(self), self.origin, rotation, translation
-        )
-        parameters.write_state(self, state)
-        self.origin = origin
+        state = parameters.read_state(self)
+        parameters.write_state(self, *map_merging.moved(state, self.origin, rotation, translation))
         return self
 
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
-        """Forget all clusters farther than ``radius`` [m] from a world position (D,).
+        """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
         Returns:
             This map.
@@ -400,14 +315,9 @@ class LardHilbertMap(nn.Module):
         Raises:
             ValueError: center is not (D,) and finite, or radius is not > 0.
         """
-        center = torch.as_tensor(center, dtype=torch.float64, device=self.origin.device)
-        if center.shape != self.origin.shape or not bool(center.isfinite().all()):
-            raise ValueError(f"center must be ({self.dim},) and finite; got {center.tolist()}")
-        if not radius > 0:
-            raise ValueError(f"radius must be > 0 m; got {radius}")
-        state = parameters.read_state(self)
-        local = self._to_map_frame(center)
-        parameters.write_state(self, map_merging.within(state, local, radius))
+        center = map_merging.check_sphere(center, radius, self.origin)
+        state = map_merging.within(parameters.read_state(self), center - self.origin, radius)
+        parameters.write_state(self, state, self.origin)
         return self
 
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
@@ -420,47 +330,7 @@ class LardHilbertMap(nn.Module):
             {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
         ]
 
-    def _train_weights(
-        self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool
-    ) -> None:
-        local, labels = deal_samples((local, labels), config.rows_a_batch(len(local)), rng)
-
-        def features_of(rows: slice) -> tuple[Tensor, Tensor]:
-            return self._nearest_features(local[rows])
-
-        weights = fit_weights(features_of, labels, self.weights.detach(), config, progress)
-        with torch.no_grad():
-            self.weights.copy_(weights)
-
-    def _grow(self, clusters: Clusters, is_occupied: Tensor, origin: Tensor) -> None:
-        """Take over clusters as centers and length-scales, with weights of 0."""
-        factors = factor_covariances(clusters.covariances, self.min_lengthscale)
-        parameters.resize(self, len(clusters))
-        with torch.no_grad():
-            self.weights.zero_()
-            self.centers.copy_(clusters.means)
-            self.raw_scale_tril.copy_(raw_factors(factors))
-        self.is_occupied, self.counts = is_occupied, clusters.counts
-        self.means, self.scatters, self.origin = clusters.means, clusters.scatters, origin
-
-    # --- what the map is on disk ---
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The arguments that make an empty map like this one."""
-        return {
-            "dim": self.dim,
-            "num_neighbors": self.num_neighbors,
-            "covariance_scale": self.covariance_scale,
-            "min_lengthscale": self.min_lengthscale,
-        }
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Format version and settings, kept in the state dict beside the tensors."""
-        return {"format_version": map_files.FORMAT_VERSION, **self.settings}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Nothing to set: `parameters.make_room` has checked that the settings agree."""
+    # --- files ---
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map to a file, atomically: `torch.save(model.state_dict(), path)`, but safe."""
@@ -475,62 +345,10 @@ class LardHilbertMap(nn.Module):
             ValueError: the file is not a map, is damaged, unsafe, or of a newer format.
         """
         state = map_files.load_state(path)
-        state.pop(map_files.STREAM_KEY, None)  # a checkpoint of a stream is a map, too
         try:
-            settings = map_files.check_settings(state.get("_extra_state"))
-            if state["centers"].shape[1:] != (settings["dim"],):
-                raise ValueError(
-                    f"centers must be (M, {settings['dim']}); got {tuple(state['centers'].shape)}"
-                )
-            model = cls(**settings).to(state["centers"].dtype)
+            settings = map_files.map_settings(state)
+            model = cls(**settings, dtype=state["centers"].dtype)
             model.load_state_dict(state)
         except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:
             raise ValueError(f"{os.fspath(path)} must hold a LardHilbertMap; {error}") from error
         return model
-
-    def _apply(self, fn: Any, recurse: bool = True) -> LardHilbertMap:
-        """`.to()`, `.float()`, `.half()`: everything follows but the float64 of the origin."""
-        origin = self.origin
-        super()._apply(fn, recurse)
-        if self.origin.dtype != torch.float64:
-            self.origin = origin.to(self.origin.device)
-        return self
-
-
-def check_points(points: Tensor, dim: int) -> None:
-    """A ValueError where points are not (..., D)."""
-    if points.ndim == 0 or points.shape[-1] != dim:
-        raise ValueError(
-            f"points must be (..., {dim}), one row of coordinates per point; "
-            f"got {tuple(points.shape)}"
-        )
-
-
-def check_axes(axes: Sequence[Tensor], dim: int) -> None:
-    """A ValueError where axes are not D lists of finite coordinates."""
-    if len(axes) != dim:
-        raise ValueError(f"axes must be {dim} lists of coordinates; got {len(axes)}")
-    if not all(bool(axis.isfinite().all()) for axis in axes):
-        raise ValueError("axes must be finite; got NaN or infinity")
-
-
-def to_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
-    """(..., D) world positions -> positions relative to an origin of whole meters, of that dtype.
-
-    Whole meters are exact in float32 too, so float32 points lose nothing.
-    """
-    working = torch.promote_types(torch.promote_types(points.dtype, dtype), torch.float32)
-    shift = origin.to(working)
-    plain = working == dtype or points.ndim != 2 or points.requires_grad
-    if plain or torch.compiler.is_compiling():
-        return (points.to(working) - shift).to(dtype)
-    local = points.new_empty(points.shape, dtype=dtype)  # in small steps: nothing large in between
-    shift = shift.expand(min(FRAME_CHUNK, len(points)), -1).contiguous()
-    for to, part in zip(local.split(FRAME_CHUNK), points.split(FRAME_CHUNK), strict=True):
-        to.copy_(part - shift[: len(part)])
-    return local
-
-
-def _check_num_clusters(num_clusters: int | None) -> None:
-    if num_clusters is not None and num_clusters < 1:
-        raise ValueError(f"num_clusters must be 1 or more, or None; got {num_clusters}")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from lardhm_torch.scans import Scans
-
-CHECK_CHUNK = 1 << 18  # labels checked at a time: the check takes no memory to speak of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +48,7 @@ class NoUsableRayError(ValueError):
     """Scans hold no ray that can be sampled; the message counts the reasons."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Samples:
     """Training pairs, world frame.
 
@@ -68,6 +67,14 @@ class Samples:
     def __len__(self) -> int:
         """Number of points N."""
         return len(self.points)
+
+    def to(self, like: torch.device | str | torch.dtype) -> Samples:
+        """The same samples with points and labels on a device or of a floating point type.
+
+        World coordinates far from zero (UTM) lose digits in float32; maps accept float64 points.
+        """
+        ray_id = self.ray_id if isinstance(like, torch.dtype) else self.ray_id.to(like)
+        return Samples(self.points.to(like), self.labels.to(like), ray_id, self.dropped)
 
 
 def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str, int]]:
@@ -124,7 +131,7 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     free_end = torch.where(is_hit, (reach - config.near_margin).clamp(min=0), reach)
     first = _taken(scans.target_index, rays) == 1
     ahead = offsets / ranges[:, None]
-    rng = torch.Generator(device=ranges.device).manual_seed(seed)
+    rng = seeded_generator(seed, "sampling", ranges.device)
     groups = [
         _stratified_depths(first, free_end, config.free_samples, rng),
         _near_depths(is_hit & first, free_end, config, rng),
@@ -166,8 +173,9 @@ def _near_depths(
     members = _rows(rays)
     shape = (len(members), config.near_samples)
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
-    depths *= config.near_margin - config.near_reach
-    return members, depths.add_(_taken(free_end, members)[:, None]).clamp_(min=0)
+    end = _taken(free_end, members)[:, None]
+    # A short ray is sampled over its whole free part, so that no sample lies in the sensor.
+    return members, end - depths * end.clamp(max=config.near_reach - config.near_margin)
 
 
 def _rows(mask: Tensor) -> Tensor:
@@ -182,35 +190,23 @@ def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
     return tensor if len(rows) == len(tensor) else tensor.index_select(0, rows)
 
 
-def check_samples(
-    points: Tensor, labels: Tensor, dim: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not."""
-    points = torch.as_tensor(points, device=device).detach()
-    labels = torch.as_tensor(labels, device=device).detach()
-    if points.ndim != 2 or points.shape[1] != dim:
-        raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
-    if labels.shape != points.shape[:1]:
-        raise ValueError(
-            f"labels must be ({len(points)},), one per point; got {tuple(labels.shape)}"
-        )
-    if len(points) == 0:
-        raise ValueError("points must hold at least one point; got 0")
-    # The sum takes no memory, and is not finite if a coordinate is not.
-    bad = points.new_zeros(0) if bool(points.sum().isfinite()) else ~points.isfinite().all(dim=1)
-    if bool(bad.any()):
-        raise ValueError(
-            f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
-            f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
-        )
-    strange = next((c for c in labels.split(CHECK_CHUNK) if not _zeros_and_ones(c)), None)
-    if strange is not None:
-        value = strange[(strange != 0) & (strange != 1)][0].item()
-        cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
-    return points, labels
+def seeded_generator(
+    seed: int, purpose: str, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """A generator whose numbers depend on the seed and on what they are for.
 
+    Sampling, clustering and training with the same seed must not draw the same numbers: points
+    would be placed and chosen by one sequence.
 
-def _zeros_and_ones(values: Tensor) -> bool:
-    """Whether no value is another: only 0, 1 and infinity are their own squares."""
-    return torch.equal(values * values, values) and bool(values.sum() <= len(values))
+    Args:
+        seed: any integer.
+        purpose: name of the stream, for example "sampling".
+        device: where the numbers are drawn.
+
+    Raises:
+        ValueError: seed is not an integer.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int):
+        raise ValueError(f"seed must be an integer; got {seed!r}")
+    digest = hashlib.blake2b(f"{purpose} {seed}".encode(), digest_size=8).digest()
+    return torch.Generator(device=device).manual_seed(int.from_bytes(digest, "little") >> 1)

@@ -16,7 +16,13 @@ from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.clustering import scan_clusters, split_classes
 from lardhm_torch.learning.update import UpdateConfig
-from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
+from lardhm_torch.sampling import (
+    NoUsableRayError,
+    Samples,
+    SamplingConfig,
+    sample_rays,
+    seeded_generator,
+)
 from lardhm_torch.scans import Scans
 
 
@@ -156,9 +162,9 @@ def _save(model: LardHilbertMap, seen: Progress, path: str | os.PathLike[str]) -
 def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig) -> None:
     seed = config.seed + number
     if config.max_rays is not None and len(scan) > config.max_rays:
-        rng = torch.Generator(device=scan.ends.device).manual_seed(seed)
-        rows = torch.randint(len(scan), (config.max_rays,), generator=rng, device=rng.device)
-        scan = scan.select(rows)
+        rng = seeded_generator(seed, "thinning", scan.ends.device)
+        rows = torch.randperm(len(scan), generator=rng, device=rng.device)[: config.max_rays]
+        scan = scan.select(rows.sort().values)
     try:
         samples = sample_rays(scan, config.sampling, seed=seed)
     except NoUsableRayError as error:

@@ -13,13 +13,13 @@ from lardhm_torch.learning.clustering import (
     cluster_classes,
     cluster_points,
     clusters_about,
-    factor_covariances,
     merge_small,
     mini_batch_kmeans,
     pool_clusters,
     split_clusters,
-    z_order,
 )
+from lardhm_torch.learning.map_state import factor_covariances
+from lardhm_torch.points import morton_order
 
 F64 = torch.float64
 
@@ -102,7 +102,7 @@ def test_where_all_clusters_are_small_one_remains():
 @pytest.mark.parametrize("seed", range(3))
 def test_inertia_is_no_worse_than_scikit_learns(seed):
     points = torch.rand(8000, 3, generator=rng(seed)) ** 2  # uneven density
-    points = points[z_order(points)]
+    points = points[morton_order(points)]
     ours = inertia(points, mini_batch_kmeans(points, 100, rng(seed)))
     theirs = MiniBatchKMeans(100, random_state=seed, n_init=3).fit(points.numpy())
     assert ours <= 1.02 * inertia(points, torch.tensor(theirs.cluster_centers_))

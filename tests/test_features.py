@@ -89,7 +89,12 @@ def test_feature_matrix_is_sparse_coalesced_and_multiplies():
     matrix = feature_matrix(indices, values, 40)
     assert matrix.is_coalesced()
     assert matrix._nnz() == 30 * 5
-    torch.testing.assert_close(matrix.coalesce().indices(), matrix.indices())
+    unsorted = torch.sparse_coo_tensor(
+        matrix.indices(), matrix.values(), matrix.shape, check_invariants=True
+    )
+    assert not unsorted.is_coalesced()  # so that `coalesce` sorts and adds up, and proves the flag
+    assert torch.equal(unsorted.coalesce().indices(), matrix.indices())
+    assert torch.equal(unsorted.coalesce().values(), matrix.values())
     weights = torch.randn(40, 1, dtype=F64)
     product = torch.sparse.mm(matrix, weights).squeeze(1)
     torch.testing.assert_close(product, (values * weights[indices, 0]).sum(dim=1))

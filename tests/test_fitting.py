@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
 
 from lardhm_torch import native
@@ -216,3 +218,12 @@ def test_native_training_features_equal_the_definition(dim):
     found = native.nearest_features(points, centers, raw, kernel, native.build_index(centers, 5))
     assert torch.equal(found[0].long(), expected[0])
     torch.testing.assert_close(found[1], expected[1])
+
+
+@given(count=st.integers(1, 100_000), asked=st.one_of(st.none(), st.integers(1, 5000)))
+def test_all_batches_of_a_pass_are_about_equally_large(count, asked):
+    size = FitConfig(batch_size=asked).rows_a_batch(count)
+    batches = -(-count // size)
+    last = count - (batches - 1) * size
+    assert size <= (asked or max(256, count // 128))
+    assert size - last < batches  # by less than one point a batch

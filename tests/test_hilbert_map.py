@@ -224,7 +224,7 @@ def test_bad_samples_are_refused_and_the_map_is_as_it_was(case):
 def test_a_fit_that_fails_half_way_leaves_the_map_as_it_was(monkeypatch):
     model = wall_map()
     before = copy.deepcopy(model)
-    monkeypatch.setattr("lardhm_torch.hilbert_map.fit_weights", lambda *_: 1 / 0)
+    monkeypatch.setattr("lardhm_torch.learning.fitting.fit_weights", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         model.fit(*wall(), num_clusters=7)
     assert same_map(model, before)
@@ -272,7 +272,9 @@ def test_queries_of_the_wrong_shape_and_cluster_numbers_below_one_are_refused():
         model(torch.zeros(4, 2))
     with pytest.raises(ValueError, match=r"points must be \(N, 3\); got \(3,\)"):
         model.features(torch.zeros(3))
-    with pytest.raises(ValueError, match="num_clusters must be 1 or more, or None; got 0"):
+    with pytest.raises(
+        ValueError, match=r"num_clusters must be a whole number.*; got 0"
+    ):
         model.fit(*wall(), num_clusters=0)
 
 
@@ -328,3 +330,41 @@ def test_a_lattice_gives_what_its_points_give(dim):
         model.query_lattice([*axes, axes[0]])
     with pytest.raises(ValueError, match="axes must be finite"):
         model.query_lattice([axes[0] * torch.inf, *axes[1:]])
+
+
+def test_an_empty_map_is_true_and_takes_device_and_dtype_from_its_arguments():
+    model = LardHilbertMap(2, device="cpu", dtype=torch.float64)
+    assert model
+    assert len(model) == 0
+    assert {t.dtype for t in (model.weights, model.centers, model.means)} == {torch.float64}
+    with pytest.raises(ValueError, match=r"dtype must be a floating point type; got torch\.int32"):
+        LardHilbertMap(2, dtype=torch.int32)
+
+
+def test_arrays_and_lists_work_where_tensors_do():
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    labels = (points[:, 0] > 0.5).long()
+    model = LardHilbertMap().fit(points, labels, 10)
+    for convert in (lambda t: t.numpy(), lambda t: t.tolist()):
+        other = LardHilbertMap().fit(convert(points), convert(labels), 10)
+        assert torch.equal(other.weights, model.weights)
+        assert torch.equal(other(convert(points + 1e6)), model(points + 1e6))
+        other.update(convert(points), convert(labels))
+
+
+def test_a_number_of_clusters_that_is_not_whole_is_refused():
+    for wrong in (100.0, True, "4"):
+        with pytest.raises(ValueError, match=r"num_clusters must be a whole number.*got"):
+            LardHilbertMap().fit(torch.rand(40, 3), torch.ones(40), wrong)
+
+
+def test_a_saved_state_dict_holds_no_reserve_of_a_growing_map(tmp_path):
+    rng = torch.Generator().manual_seed(0)
+    model = LardHilbertMap()
+    for place in range(4):
+        points = torch.rand(2000, 3, generator=rng) + 5 * place
+        model.update(points, (points[:, 0] % 1 > 0.5).float())
+    torch.save(model.state_dict(), tmp_path / "map.pt")
+    tensors = [t for t in model.state_dict().values() if isinstance(t, torch.Tensor)]
+    content = sum(t.nbytes for t in tensors)
+    assert (tmp_path / "map.pt").stat().st_size < 1.05 * content + 8192

@@ -11,7 +11,8 @@ from native_maps import (
 )
 
 from lardhm_torch import native
-from lardhm_torch.learning.clustering import mini_batch_kmeans, z_order
+from lardhm_torch.learning.clustering import mini_batch_kmeans
+from lardhm_torch.points import morton_order
 
 
 @dtypes
@@ -60,10 +61,10 @@ def test_native_kmeans_equals_the_plain_loop(ops, dim, dtype, monkeypatch):
 def test_the_native_z_order_equals_the_plain_one(ops, dim, dtype, monkeypatch):
     points = torch.cat([make_points(2000, dim, dtype), torch.zeros(50, dim, dtype=dtype)])
     for given in (points, points[:1], points[-50:]):
-        fast = z_order(given)
+        fast = morton_order(given)
         with monkeypatch.context() as patch:
             patch.setattr(native, "supports", lambda points: False)
-            assert torch.equal(fast, z_order(given))
+            assert torch.equal(fast, morton_order(given))
 
 
 def test_rows_that_are_not_there_are_refused(ops):

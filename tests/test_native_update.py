@@ -14,13 +14,9 @@ from lardhm_torch.learning.assignment import (
     unexplained,
 )
 from lardhm_torch.learning.cluster_matching import pool_into
-from lardhm_torch.learning.clustering import (
-    Clusters,
-    along_curve,
-    cluster_points,
-    factor_covariances,
-)
-from lardhm_torch.learning.parameters import MapState
+from lardhm_torch.learning.clustering import Clusters, cluster_points
+from lardhm_torch.learning.map_state import MapState, factor_covariances
+from lardhm_torch.points import in_morton_order
 
 both_paths = pytest.mark.parametrize("native_path", [True, False])
 
@@ -90,7 +86,7 @@ def test_all_points_inside_a_cluster_are_possibly_inside(dtype, dim, native_path
     path(native_path)
     rng = torch.Generator().manual_seed(0)
     sources = torch.rand(400, dim, generator=rng, dtype=dtype) * torch.arange(1, dim + 1)
-    clusters = cluster_points(along_curve(sources)[0], 20, rng)
+    clusters = cluster_points(in_morton_order(sources)[0], 20, rng)
     points = 8 * torch.rand(20_000, dim, generator=rng, dtype=dtype) - 4
     inside = explain(points, clusters, 0.01, 3.0, 3.0)[0] < len(clusters)
     possible = possibly_inside(points, clusters, 0.01, 3.0)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lardhm_torch.sampling import SamplingConfig, sample_rays
+from lardhm_torch.sampling import SamplingConfig, sample_rays, seeded_generator
 from lardhm_torch.scans import Scans, split_rays
 
 
@@ -141,3 +141,30 @@ def test_split_rays_gives_every_ray_to_one_side():
     assert len(train) == 140
     both = torch.cat([train.ends, test.ends])
     assert torch.equal(both.sort(dim=0).values, scans.ends.sort(dim=0).values)
+
+
+def test_near_samples_of_a_short_ray_spread_over_its_free_part():
+    ends = torch.tensor([[0.4, 0.0, 0.0]]).repeat(500, 1)
+    config = SamplingConfig(free_samples=1, near_samples=8)
+    samples = sample_rays(Scans(torch.zeros(1, 3), ends), config)
+    near = samples.points[-4000:, 0]
+    assert float(near.min()) > 0
+    assert float(near.max()) <= 0.25 + 1e-12
+    assert float((near < 0.125).double().mean()) == pytest.approx(0.5, abs=0.05)
+
+
+def test_samples_can_be_had_in_another_dtype():
+    samples = sample_rays(Scans(torch.zeros(1, 3), torch.rand(5, 3) + 1)).to(torch.float32)
+    assert samples.points.dtype == samples.labels.dtype == torch.float32
+    assert samples.ray_id.dtype == torch.int64
+
+
+def test_seeds_give_independent_streams_for_every_purpose():
+    one, again, other = (
+        torch.rand(1000, generator=seeded_generator(3, purpose))
+        for purpose in ("sampling", "sampling", "fit")
+    )
+    assert torch.equal(one, again)
+    assert abs(float(torch.corrcoef(torch.stack([one, other]))[0, 1])) < 0.1
+    with pytest.raises(ValueError, match=r"seed must be an integer; got 1\.5"):
+        seeded_generator(1.5, "sampling")

@@ -145,3 +145,9 @@ def test_a_column_in_which_only_the_origin_differs_is_not_dropped(origin_height)
     scans = Scans(torch.tensor([[0.0, 0.0, origin_height]]), torch.tensor([[1.0, 2.0, 1.0]]))
     with pytest.raises(ValueError, match="last coordinate must be constant"):
         scans.drop_constant_column()
+
+
+def test_scans_compare_by_identity_without_an_error():
+    scans = Scans(torch.zeros(1, 3), torch.rand(5, 3))
+    assert scans == scans
+    assert scans != Scans(scans.origins, scans.ends)

@@ -6,7 +6,8 @@ import torch
 
 from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
-from lardhm_torch.learning.parameters import MapState, assign_state
+from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.parameters import assign_state
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.manifest import write_manifest

@@ -69,6 +69,21 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
     return state
 
 
+def map_settings(state: dict[str, Any]) -> dict[str, Any]:
+    """The settings of the map in a state dict, which is left without the keys of a stream.
+
+    Raises:
+        ValueError: the state is not that of a map, or of another format version.
+    """
+    state.pop(STREAM_KEY, None)  # a checkpoint of a stream is a map, too
+    settings = check_settings(state.get("_extra_state"))
+    if state["centers"].shape[1:] != (settings["dim"],):
+        raise ValueError(
+            f"centers must be (M, {settings['dim']}); got {tuple(state['centers'].shape)}"
+        )
+    return settings
+
+
 def check_settings(extra: Any) -> dict[str, Any]:
     """The settings in a map's extra state, without the format version, or a ValueError."""
     if not isinstance(extra, dict) or not isinstance(extra.get("format_version"), int):

@@ -7,12 +7,8 @@ from torch import Tensor
 
 from lardhm_torch import features, native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.clustering import (
-    Clusters,
-    clusters_about,
-    factor_covariances,
-    points_where,
-)
+from lardhm_torch.learning.clustering import Clusters, clusters_about, points_where
+from lardhm_torch.learning.map_state import factor_covariances
 
 
 def reaching(
@@ -49,7 +45,7 @@ def explain(
     Args:
         points: (N, D) positions [m].
         clusters: M of them, at least one.
-        floor: smallest standard deviation [m], see `clustering.factor_covariances`.
+        floor: smallest standard deviation [m], see `map_state.factor_covariances`.
         radius: nearer points join the cluster.
         reach: nearer points have an owner; not less than ``radius``.
 
@@ -89,7 +85,7 @@ def possibly_inside(points: Tensor, clusters: Clusters, floor: float, radius: fl
     Args:
         points: (N, D) positions [m].
         clusters: M of them.
-        floor: smallest standard deviation [m], see `clustering.factor_covariances`.
+        floor: smallest standard deviation [m], see `map_state.factor_covariances`.
         radius: standard deviations within which a point is inside.
     """
     if native.supports(points):

@@ -9,13 +9,8 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import raw_factors, squared_distances
-from lardhm_torch.learning.clustering import (
-    Clusters,
-    concatenate_clusters,
-    factor_covariances,
-    pool_clusters,
-)
-from lardhm_torch.learning.parameters import MapState
+from lardhm_torch.learning.clustering import Clusters, concatenate_clusters, pool_clusters
+from lardhm_torch.learning.map_state import MapState, factor_covariances, new_rows
 
 
 def match_clusters(
@@ -127,8 +122,18 @@ def moved_factors(raw_scale_tril: Tensor, before: Tensor, after: Tensor) -> Tens
 def append_clusters(
     known: MapState, new: Clusters, is_occupied: Tensor, floor: float, where: Tensor | None = None
 ) -> MapState:
-    """New clusters, weight 0, after the known ones; the first take over the rows ``where``."""
-    raw = raw_factors(factor_covariances(new.covariances, floor))
+    """New clusters, weight 0, after the known ones; the first replace the rows ``where``.
+
+    A replaced row passes its weight on.
+    """
     where = known.counts[:0] if where is None else where
-    weights = torch.cat([known.weights[where], raw.new_zeros(len(new) - len(where))])
-    return known.put(where, MapState(weights, new.means, raw, is_occupied, *new))
+    rows = new_rows(new, is_occupied, floor)
+    return known.put(
+        where,
+        replace(
+            rows,
+            weights=rows.weights.index_copy(
+                0, torch.arange(len(where), device=where.device), known.weights[where]
+            ),
+        ),
+    )

@@ -6,6 +6,7 @@ each center are its moments (eq. 6, 7), which pool exactly when clusters merge.
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.native import nearest_centers
+from lardhm_torch.points import morton_order
 
 POINTS_PER_CLUSTER = 15  # of the rule that chooses the number of clusters, where points are sparse
 DENSE_POINTS = 35  # the same where they are dense, or clusters would fit the noise of the hits
@@ -33,7 +35,7 @@ class Columns:
         return (getattr(self, field.name) for field in fields(self))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Clusters(Columns):
     """Moments of M clusters: enough to pool them, nothing that training changes.
 
@@ -61,7 +63,7 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     """At most ``num_clusters`` clusters of the points, none of fewer than five unless there are fewer.
 
     Args:
-        points: (N, D) positions of one class [m], in the order of `z_order`.
+        points: (N, D) positions of one class [m], in the order of `morton_order`.
         num_clusters: how many to look for; more than N / 5 means N / 5.
         rng: random state of the start and of the batches.
 
@@ -72,7 +74,7 @@ def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> C
     _, counts, sums, scatters = native.assign(points, centers)
     clusters = merge_small(clusters_about(centers, counts, sums, scatters))
     # Neighbors in space are neighbors in memory: queries of large maps are faster.
-    order = z_order(clusters.means)
+    order = morton_order(clusters.means)
     return Clusters(*(moments[order] for moments in clusters))
 
 
@@ -82,7 +84,7 @@ def cluster_classes(
     """Occupied and free points clustered apart, as the paper found to work better (Section II-B).
 
     Args:
-        points: (N, D) positions [m], in the order of `z_order`.
+        points: (N, D) positions [m], in the order of `morton_order`.
         labels: (N,) 1 occupied, 0 free.
         num_clusters: total over both classes; None: chosen from the data.
         rng: random state.
@@ -104,7 +106,7 @@ def cluster_each(
     """(M clusters, (M,) bool which are occupied) of the occupied and of the free points, in order.
 
     Args:
-        classes: (N, D) occupied and (F, D) free positions [m], in the order of `z_order`.
+        classes: (N, D) occupied and (F, D) free positions [m], in the order of `morton_order`.
         totals: how many clusters of each to look for.
         rng: random state.
     """
@@ -184,6 +186,17 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
     return max(1, min(max(count, coarsest), finest, MAX_CHOSEN))
 
 
+def check_num_clusters(num_clusters: int | None) -> None:
+    """Raise a ValueError if the number of clusters is neither None nor a positive integer."""
+    if num_clusters is None:
+        return
+    whole = isinstance(num_clusters, numbers.Integral) and not isinstance(num_clusters, bool)
+    if not whole or num_clusters < 1:
+        raise ValueError(
+            f"num_clusters must be a whole number, 1 or more, or None; got {num_clusters!r}"
+        )
+
+
 def mini_batch_kmeans(
     points: Tensor,
     num_clusters: int,
@@ -202,7 +215,7 @@ def mini_batch_kmeans(
     every ``restart_every`` iterations, so that a center forgets the points it met on its way.
 
     Args:
-        points: (N, D) positions [m], in the order of `z_order`; in another order the result is
+        points: (N, D) positions [m], in the order of `morton_order`; in another order the result is
             as valid, but worse.
         num_clusters: how many, at most N.
         rng: random state of the start and of the batches.
@@ -260,30 +273,6 @@ def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) 
     place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
     place += torch.arange(count, device=rng.device)
     return (place * (num_points / count)).long().clamp_(max=num_points - 1)
-
-
-def along_curve(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
-    """(N, D) points and other (N, ...) columns of theirs in the order of `z_order`.
-
-    Neighbors in space are then neighbors in memory, and all else is faster.
-    """
-    order = z_order(points)
-    return tuple(column.index_select(0, order) for column in (points, *columns))
-
-
-def z_order(points: Tensor) -> Tensor:
-    """(N, D) positions -> (N,) rows in the order of a space-filling curve (Morton code), int64."""
-    if native.supports(points):
-        return torch.ops.lardhm.z_order(points)
-    bits = min(10, 62 // points.shape[1])
-    lower, upper = points.amin(dim=0), points.amax(dim=0)
-    edge = (upper - lower).max().clamp(min=torch.finfo(points.dtype).tiny)
-    cells = ((points - lower) / edge * (2**bits - 1)).long()
-    code = torch.zeros(len(points), dtype=torch.long, device=points.device)
-    for bit in range(bits):
-        for axis in range(points.shape[1]):
-            code |= ((cells[:, axis] >> bit) & 1) << (bit * points.shape[1] + axis)
-    return code.argsort(stable=True)
 
 
 def clusters_about(centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor) -> Clusters:
@@ -346,23 +335,3 @@ def merge_small(clusters: Clusters, min_count: int = MIN_COUNT) -> Clusters:
     small = (~large).nonzero().squeeze(1)
     groups[small] = nearest_centers(clusters.means[small], clusters.means[kept], 1).squeeze(1)
     return pool_clusters(clusters, groups, len(kept))
-
-
-def factor_covariances(covariances: Tensor, floor: float) -> Tensor:
-    """Lower Cholesky factors, valid for flat, line-like and single-point clusters too.
-
-    ``floor``^2 is added to every variance: no axis is thinner than ``floor``, a single point
-    becomes a ball of that size, and wide clusters hardly change. A relative 1e-6 of the largest
-    variance keeps long thin clusters factorable in float32.
-
-    Args:
-        covariances: (M, D, D) [m^2], positive semi-definite up to rounding.
-        floor: smallest standard deviation [m].
-
-    Returns:
-        (M, D, D) lower factors [m] with positive diagonals.
-    """
-    largest = covariances.diagonal(dim1=-2, dim2=-1).amax(dim=-1)
-    ridge = floor**2 + 1e-6 * largest
-    eye = torch.eye(covariances.shape[-1], dtype=covariances.dtype, device=covariances.device)
-    return torch.linalg.cholesky(covariances + ridge[:, None, None] * eye)

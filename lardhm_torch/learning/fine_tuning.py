@@ -11,9 +11,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import native
-from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.learning.fitting import balance_classes, label_factors, logistic_loss
-from lardhm_torch.sampling import Samples, check_samples
+from lardhm_torch.learning.parameters import MapParameters
+from lardhm_torch.points import check_samples, to_map_frame
+from lardhm_torch.sampling import Samples, seeded_generator
 
 WARM_UP_STEPS = 20  # over which the rates rise to their full value
 MAX_BATCH = 1 << 15  # points a step where none is asked for: memory does not grow with N
@@ -22,7 +23,7 @@ JUDGED_POINTS = 1 << 16  # whose loss is told after each epoch
 
 
 def fine_tune(
-    model: LardHilbertMap,
+    model: MapParameters,
     points: Tensor,
     labels: Tensor,
     *,
@@ -77,7 +78,7 @@ def fine_tune(
         raise ValueError(
             "ray_id must be given where held-out rays are to be sampled anew; got none"
         )
-    rng = torch.Generator(device=model.origin.device).manual_seed(seed)
+    rng = seeded_generator(seed, "fine_tune", model.origin.device)
     held_rays = _hold_out(samples, config.hold_out, rng)
     train, judged = _divide(samples, held_rays)
     run = TuningRun(model, config, rng)
@@ -101,7 +102,7 @@ def fine_tune(
 
 
 def _check(
-    model: LardHilbertMap, points: Tensor, labels: Tensor, ray_id: Tensor | None
+    model: MapParameters, points: Tensor, labels: Tensor, ray_id: Tensor | None
 ) -> LabelledPoints:
     points, labels = check_samples(points, labels, model.dim, model.origin.device)
     if ray_id is not None:
@@ -191,7 +192,7 @@ class LabelledPoints(NamedTuple):
 class TuningRun:
     """A map's parameters as offsets in units of each cluster, which is what Adam moves."""
 
-    def __init__(self, model: LardHilbertMap, config: TuneConfig, rng: torch.Generator) -> None:
+    def __init__(self, model: MapParameters, config: TuneConfig, rng: torch.Generator) -> None:
         self.model, self.config, self.rng = model, config, rng
         self.epoch, self.step, self.losses = 0, 0, list[float]()
         self._start_from([value.detach().clone() for value in self.parameters_of_map()])
@@ -231,7 +232,7 @@ class TuningRun:
 
     def log_odds(self, points: Tensor, weights: Tensor, centers: Tensor, raw: Tensor) -> Tensor:
         """(B, D) world positions -> (B,) logits of the map with these parameters."""
-        local = self.model._to_map_frame(points)
+        local = to_map_frame(points, self.model.origin, centers.dtype)
         return native.occupancy(local, centers, raw, weights, self.model.kernel, probability=False)
 
     def train(self, samples: LabelledPoints) -> None:

@@ -1,9 +1,9 @@
-"""Weights by stochastic gradient descent on the regularized logistic loss (eq. 2 to 4)."""
+"""All samples at once: clusters, then weights by stochastic gradient descent (eq. 2 to 4)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -11,6 +11,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import native
+from lardhm_torch.features import Kernel
+from lardhm_torch.learning.clustering import cluster_classes
+from lardhm_torch.learning.map_state import MapState, new_rows
 
 CHUNK_ROWS = 1 << 21  # points whose features are computed at a time
 CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
@@ -40,8 +43,9 @@ class FitConfig:
     occupied_share: float = 0.6
 
     def rows_a_batch(self, num_points: int) -> int:
-        """Points a step."""
-        return self.batch_size or max(256, num_points // 128)
+        """Points a step: about ``batch_size``, such that all batches of a pass are equally large."""
+        wanted = self.batch_size or max(256, num_points // 128)
+        return -(-num_points // -(-num_points // wanted)) if num_points else wanted
 
     def __post_init__(self) -> None:
         if self.passes < 1:
@@ -56,6 +60,42 @@ class FitConfig:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
 
+class FitTask(NamedTuple):
+    """What a fit needs beside the samples."""
+
+    kernel: Kernel
+    config: FitConfig
+    rng: torch.Generator
+    progress: bool = False
+
+
+def fit_clusters(
+    points: Tensor, labels: Tensor, num_clusters: int | None, task: FitTask
+) -> MapState:
+    """Clusters of the samples, each class on its own, with trained weights.
+
+    Args:
+        points: (N, D) positions in the map's frame [m], in Morton order.
+        labels: (N,) 1 occupied, 0 free, of the points' dtype.
+        num_clusters: total over both classes; None: chosen from the data.
+        task: kernel, settings, random state.
+
+    Source: Guizilini & Ramos 2016, Sections II and III.
+    """
+    clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
+    state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
+    columns = (points, labels)
+    points, labels = deal_samples(columns, task.config.rows_a_batch(len(points)), task.rng)
+    index = native.build_index(state.centers, task.kernel.num_neighbors)
+
+    def features_of(rows: slice) -> tuple[Tensor, Tensor]:
+        centers, factors = state.centers, state.raw_scale_tril
+        return native.nearest_features(points[rows], centers, factors, task.kernel, index)
+
+    weights = fit_weights(features_of, labels, state.weights, task.config, task.progress)
+    return replace(state, weights=weights)
+
+
 def deal_samples(
     columns: tuple[Tensor, ...], batch_size: int, rng: torch.Generator
 ) -> tuple[Tensor, ...]:
@@ -66,7 +106,7 @@ def deal_samples(
     to each other in memory.
 
     Args:
-        columns: (N, ...) positions, labels or features of the samples, in the order of `z_order`.
+        columns: (N, ...) positions, labels or features of the samples, in the order of `morton_order`.
         batch_size: samples a batch.
         rng: random state.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -12,10 +12,14 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
-from lardhm_torch.learning.clustering import concatenate_clusters, factor_covariances, pool_clusters
+from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.fitting import FitConfig
-from lardhm_torch.learning.parameters import MapState, read_state, write_state
+from lardhm_torch.learning.map_state import MapState, factor_covariances
+from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
 from lardhm_torch.learning.replay import Evidence, join_evidence, learn, recalled_evidence
+from lardhm_torch.sampling import seeded_generator
+
+AnyMap = TypeVar("AnyMap", bound=MapParameters)
 
 ZETA = 1.0  # [m] clusters of two maps that are farther apart never match (Algorithm 2)
 RECALLED = 16  # points drawn from each cluster to see whether two maps contradict each other
@@ -83,12 +87,26 @@ def _turned_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
     return raw_factors((signs[..., None] * upper).mT).to(raw_scale_tril.dtype)
 
 
+def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
+    """A center as a (D,) float64 tensor, world frame [m].
+
+    Raises:
+        ValueError: center is not (D,) and finite, or radius is not > 0.
+    """
+    center = torch.as_tensor(center, dtype=torch.float64, device=origin.device)
+    if center.shape != origin.shape or not bool(center.isfinite().all()):
+        raise ValueError(f"center must be ({len(origin)},) and finite; got {center.tolist()}")
+    if not radius > 0:
+        raise ValueError(f"radius must be > 0 m; got {radius}")
+    return center
+
+
 def within(state: MapState, center: Tensor, radius: float) -> MapState:
-    """The clusters whose centers are at most ``radius`` [m] from a point of the map frame."""
+    """The clusters whose centers are at most ``radius`` [m] from a position in the map's frame."""
     return state.rows(torch.linalg.vector_norm(state.centers - center, dim=1) <= radius)
 
 
-def merge_maps(first: Any, second: Any, *, seed: int = 0) -> Any:
+def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     """One map of two, in the frame of the first; both stay as they are.
 
     Clusters that match by Algorithm 2 are pooled, with weights and centers averaged by the number
@@ -117,16 +135,15 @@ def merge_maps(first: Any, second: Any, *, seed: int = 0) -> Any:
         return joined
     ours, theirs = read_state(first), read_state(second)
     if len(first) == 0:
-        joined.origin = second.origin.clone()
-        write_state(joined, MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True))))
+        taken = MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True)))
+        write_state(joined, taken, second.origin.clone())
         return joined
     shift = (second.origin - first.origin).to(ours.means)
     theirs = MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True)))
     theirs = replace(theirs, centers=theirs.centers + shift, means=theirs.means + shift)
-    rng = torch.Generator(device=shift.device).manual_seed(seed)
-    write_state(
-        joined, _settled(_pooled(ours, theirs, first.kernel), ours, theirs, first.kernel, rng)
-    )
+    rng = seeded_generator(seed, "merge_maps", shift.device)
+    pooled = _pooled(ours, theirs, first.kernel)
+    write_state(joined, _settled(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
     return joined
 
 

@@ -1,21 +1,144 @@
-"""The tensors of a map: rows, and how their number changes in place."""
+"""The tensors of a map as a torch module, and how their number of rows changes in place."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.clustering import Clusters, Columns
+from lardhm_torch.learning.map_state import MapState
 
 OF_THE_WHOLE = ("origin", "posterior_scales")  # tensors that are not a row a cluster
 RESERVE = 0.25  # of a map's clusters: room that a growing map keeps for more
 
 
-def resize(model: Any, num_clusters: int, *, keep: bool = False) -> None:
+class MapParameters(nn.Module):
+    """The tensors and settings of a map: everything that is learned, saved and moved to a device.
+
+    Args and attributes: see `LardHilbertMap`.
+    """
+
+    weights: nn.Parameter
+    centers: nn.Parameter
+    raw_scale_tril: nn.Parameter
+    is_occupied: Tensor
+    counts: Tensor
+    means: Tensor
+    scatters: Tensor
+    posterior_means: Tensor
+    posterior_variances: Tensor
+    posterior_scales: Tensor
+    origin: Tensor
+
+    def __init__(
+        self,
+        dim: int = 3,
+        num_neighbors: int = 16,
+        *,
+        covariance_scale: float = 4.0,
+        min_lengthscale: float = 0.01,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        check_settings(dim, num_neighbors, covariance_scale, min_lengthscale)
+        self.dim = dim
+        self.num_neighbors = num_neighbors
+        self.covariance_scale = float(covariance_scale)
+        self.min_lengthscale = float(min_lengthscale)
+        self._register_empty(dim, device, dtype)
+        self._index = torch.empty(0, dtype=torch.uint8)
+        self._reserves: dict[str, tuple[int, int]] = {}  # of `resize`
+        self.register_load_state_dict_pre_hook(make_room)
+        self.register_state_dict_post_hook(drop_reserve)
+
+    def _register_empty(
+        self, dim: int, device: torch.device | str | None, dtype: torch.dtype | None
+    ) -> None:
+        """Register parameters and buffers without clusters."""
+        weights = torch.zeros(0, device=device, dtype=dtype)
+        if not weights.is_floating_point():
+            raise ValueError(f"dtype must be a floating point type; got {dtype}")
+        columns = {
+            "weights": nn.Parameter(weights),
+            "centers": nn.Parameter(weights.new_zeros(0, dim), requires_grad=False),
+            "raw_scale_tril": nn.Parameter(weights.new_zeros(0, dim, dim), requires_grad=False),
+        }
+        for name, parameter in columns.items():
+            self.register_parameter(name, parameter)
+        buffers = {
+            "is_occupied": weights.new_zeros(0, dtype=torch.bool),
+            "counts": weights.new_zeros(0, dtype=torch.long),
+            "means": weights.new_zeros(0, dim),
+            "scatters": weights.new_zeros(0, dim, dim),
+            "posterior_means": weights.new_zeros(0),
+            "posterior_variances": weights.new_zeros(0),
+            "posterior_scales": weights.new_ones(2),
+            "origin": weights.new_zeros(dim, dtype=torch.float64),
+        }
+        for name, tensor in buffers.items():
+            self.register_buffer(name, tensor)
+
+    def __len__(self) -> int:
+        """Number of clusters M."""
+        return len(self.weights)
+
+    def __bool__(self) -> bool:
+        """A map is true, also while it is empty."""
+        return True
+
+    @property
+    def scale_tril(self) -> Tensor:
+        """(M, D, D) lower Cholesky factors of the kernels [m], with covariance scale and floor."""
+        return kernel_factors(self.raw_scale_tril, self.kernel)
+
+    @property
+    def kernel(self) -> Kernel:
+        """Number of neighbors, covariance scale and floor of the kernels."""
+        return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments that make an empty map like this one."""
+        return {
+            "dim": self.dim,
+            "num_neighbors": self.num_neighbors,
+            "covariance_scale": self.covariance_scale,
+            "min_lengthscale": self.min_lengthscale,
+        }
+
+    def state_tensors(self) -> Iterator[tuple[str, Tensor]]:
+        """Names and tensors of all parameters and buffers."""
+        yield from self.named_parameters(recurse=False)
+        yield from self.named_buffers(recurse=False)
+
+    def extra_repr(self) -> str:
+        """Settings and size, for `print(model)`."""
+        settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())
+        return f"num_clusters={len(self)}, {settings}"
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Format version and settings, kept in the state dict beside the tensors."""
+        return {"format_version": map_files.FORMAT_VERSION, **self.settings}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Nothing to set: `make_room` has checked that the settings agree."""
+
+    def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
+        """`.to()`, `.float()`, `.half()`: everything is cast but the float64 origin."""
+        origin = self.origin
+        super()._apply(fn, recurse)
+        if self.origin.dtype != torch.float64:
+            self.origin = origin.to(self.origin.device)
+        return self
+
+
+def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> None:
     """Room for another number of clusters; parameters stay the same objects, so optimizers see it.
 
     Args:
@@ -26,8 +149,8 @@ def resize(model: Any, num_clusters: int, *, keep: bool = False) -> None:
     """
     if len(model) == num_clusters:
         return
-    for name, tensor in {**model._parameters, **model._buffers}.items():
-        if tensor is None or name in OF_THE_WHOLE:
+    for name, tensor in list(model.state_tensors()):
+        if name in OF_THE_WHOLE:
             continue
         room = _longer(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
         if isinstance(tensor, nn.Parameter):
@@ -40,7 +163,7 @@ def _zeros(tensor: Tensor, rows: int) -> Tensor:
     return tensor.detach().new_zeros(rows, *tensor.shape[1:])
 
 
-def _longer(model: Any, name: str, rows: int) -> Tensor:
+def _longer(model: MapParameters, name: str, rows: int) -> Tensor:
     """The tensor with more or fewer rows, the added ones 0: in its own storage where that is enough.
 
     Only a reserve that was made here is used: behind another view lies somebody else's memory.
@@ -73,7 +196,7 @@ def _give_room(parameter: nn.Parameter, room: Tensor) -> None:
     parameter.data = room
 
 
-def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Before a state dict is loaded: check it whole, then take on its number of clusters."""
     extra = map_files.check_settings(state.get(prefix + "_extra_state"))
     differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
@@ -84,7 +207,8 @@ def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
             f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
             "LardHilbertMap.load"
         )
-    own = {**model._parameters, **model._buffers}
+    _fill_posterior(state, prefix)
+    own = dict(model.state_tensors())
     missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
     if missing:
         raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
@@ -99,53 +223,38 @@ def make_room(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
     resize(model, num_clusters)
 
 
-@dataclass(frozen=True)
-class MapState(Columns):
-    """Everything a map knows but its origin: M rows each (see `LardHilbertMap`)."""
-
-    weights: Tensor
-    centers: Tensor
-    raw_scale_tril: Tensor
-    is_occupied: Tensor
-    counts: Tensor
-    means: Tensor
-    scatters: Tensor
-
-    def rows(self, which: Tensor) -> MapState:
-        """The clusters of a mask or of indices, in that order, as copies."""
-        which = which.nonzero().squeeze(1) if which.dtype == torch.bool else which
-        return MapState(*(tensor.index_select(0, which) for tensor in self))
-
-    def put(self, where: Tensor, part: MapState) -> MapState:
-        """A copy with the first rows of ``part`` in the places ``where`` and its others at the end."""
-        count = len(where)
-        return MapState(
-            *(
-                torch.cat([ours, theirs[count:]]).index_copy_(0, where, theirs[:count])
-                for ours, theirs in zip(self, part, strict=True)
-            )
-        )
-
-    def __len__(self) -> int:
-        """Number of clusters M."""
-        return self.weights.shape[0]
-
-    @property
-    def clusters(self) -> Clusters:
-        """The moments."""
-        return Clusters(self.counts, self.means, self.scatters)
+def _fill_posterior(state: dict[str, Any], prefix: str) -> None:
+    """Maps saved before there was a posterior have none."""
+    weights = state.get(prefix + "weights")
+    if isinstance(weights, Tensor):
+        for name in ("posterior_means", "posterior_variances"):
+            state.setdefault(prefix + name, torch.zeros_like(weights))
+        state.setdefault(prefix + "posterior_scales", torch.ones(2, dtype=weights.dtype))
 
 
-def read_state(model: Any) -> MapState:
+def drop_reserve(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """After a state dict is made: tensors with a reserve as copies, or `torch.save` would write it."""
+    for name, _tensor in model.state_tensors():
+        value = state.get(prefix + name)
+        if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
+            state[prefix + name] = value.clone()
+
+
+def read_state(model: MapParameters) -> MapState:
     """The map's own tensors, detached, not copied."""
     return MapState(*(getattr(model, field.name).detach() for field in fields(MapState)))
 
 
-def write_state(model: Any, state: MapState) -> None:
-    """Give a map other clusters: all or, if anything fails, none.
+def write_state(model: MapParameters, state: MapState, origin: Tensor) -> None:
+    """Give a map other clusters in another frame: all or, if anything fails, none.
 
     Parameters stay the same objects, so an optimizer made before goes on (or, if it keeps a state
     of the old size, fails loudly: see `resize_optimizer`).
+
+    Args:
+        model: changed in place.
+        state: M clusters.
+        origin: (D,) float64, world = map + origin [m].
     """
     before = MapState(*(tensor.clone() for tensor in read_state(model)))
     try:
@@ -153,9 +262,10 @@ def write_state(model: Any, state: MapState) -> None:
     except BaseException:
         assign_state(model, before)
         raise
+    model.origin = origin
 
 
-def write_rows(model: Any, where: Tensor, part: MapState) -> None:
+def write_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
     """Give clusters of a map other values and append new ones: all or, if anything fails, none.
 
     What it costs depends on the rows that change, not on the size of the map.
@@ -176,7 +286,7 @@ def write_rows(model: Any, where: Tensor, part: MapState) -> None:
     model.posterior_variances.zero_()
 
 
-def assign_rows(model: Any, where: Tensor, part: MapState) -> None:
+def assign_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
     """Copy rows into a map, tensor by tensor; those after the first ``len(where)`` to its end."""
     count, added = len(where), len(part) - len(where)
     for tensor, rows in zip(read_state(model), part, strict=True):
@@ -184,16 +294,17 @@ def assign_rows(model: Any, where: Tensor, part: MapState) -> None:
         tensor[len(tensor) - added :] = rows[count:]
 
 
-def assign_state(model: Any, state: MapState) -> None:
+def assign_state(model: MapParameters, state: MapState) -> None:
     """Copy the tensors of a state into a map, one by one; a posterior of the old weights goes."""
     resize(model, len(state.weights))
     model.posterior_variances.zero_()
+    model.posterior_scales.fill_(1.0)
     with torch.no_grad():
         for field, value in zip(fields(state), state, strict=True):
             getattr(model, field.name).copy_(value)
 
 
-def resize_optimizer(optimizer: torch.optim.Optimizer, model: Any) -> None:
+def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> None:
     """Make room in an optimizer's state for the clusters that `update` appended.
 
     An optimizer without a state per parameter (plain SGD) needs nothing after growth; Adam or
@@ -216,3 +327,17 @@ def resize_optimizer(optimizer: torch.optim.Optimizer, model: Any) -> None:
                 )
             room = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
             optimizer.state[parameter][name] = torch.cat([value, room])
+
+
+def check_settings(
+    dim: int, num_neighbors: int, covariance_scale: float, min_lengthscale: float
+) -> None:
+    """Raise a ValueError if a setting of a map is out of its range."""
+    for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
+    if not covariance_scale > 0 or not min_lengthscale > 0:
+        raise ValueError(
+            "covariance_scale and min_lengthscale must be > 0; "
+            f"got {covariance_scale} and {min_lengthscale}"
+        )

@@ -10,12 +10,15 @@ small; where nothing was observed both say so, the variance being that of the pr
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lardhm_torch.learning.fitting import balance_classes
+
+FeaturesAt = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 PRIOR_VARIANCE = 0.3  # of a weight, and of the log-odds where no cluster reaches; by measurement
 QUERY_CHUNK = 1 << 17  # points whose features are held at a time
@@ -168,10 +171,41 @@ def _scale_of_side(points: Tensor) -> Tensor:
     return torch.stack([neutral, (best / neutral).clamp(min=1)])
 
 
-def fill_missing(model: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Before a state dict is loaded: maps from before there were posteriors or scales have none."""
-    weights = state.get(prefix + "weights")
-    if isinstance(weights, Tensor):
-        for name in ("posterior_means", "posterior_variances"):
-            state.setdefault(prefix + name, torch.zeros_like(weights))
-        state.setdefault(prefix + "posterior_scales", torch.ones(2, dtype=weights.dtype))
+class Posterior(NamedTuple):
+    """What is known of a map's weights: (M,) means, (M,) variances, and (2,) `posterior_scales`."""
+
+    means: Tensor
+    variances: Tensor
+    scales: Tensor
+
+
+def fit_posterior(indices: Tensor, values: Tensor, weights: Tensor, labels: Tensor) -> Posterior:
+    """Posterior of trained weights, given the features and labels of their training points.
+
+    Args:
+        indices: (N, K) nearest clusters of each training point.
+        values: (N, K) their kernel values.
+        weights: (M,) of the map.
+        labels: (N,) 1 occupied, 0 free.
+    """
+    log_odds = (values * weights[indices]).sum(dim=1)
+    variances = weight_variances(indices, values, log_odds, len(weights))
+    scales = posterior_scales(indices, values, log_odds, labels.to(values.dtype), variances)
+    return Posterior(weights.detach().clone(), variances, scales)
+
+
+def predict(features_of: FeaturesAt, points: Tensor, posterior: Posterior) -> tuple[Tensor, Tensor]:
+    """(N,) mean and (N,) variance of the log-odds at (N, D) points, some at a time.
+
+    Args:
+        features_of: (B, D) points -> indices and kernel values (B, K).
+        points: (N, D) positions in the frame of ``features_of`` [m].
+        posterior: of the map's weights.
+    """
+    parts = []
+    for chunk in points.split(QUERY_CHUNK):
+        indices, values = features_of(chunk)
+        mean = posterior_log_odds((values * posterior.means[indices]).sum(dim=1), posterior.scales)
+        parts.append(torch.stack([mean, latent_variance(indices, values, posterior.variances)]))
+    mean, variance = torch.cat(parts, dim=1)
+    return mean, variance

@@ -14,21 +14,16 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import explain, ordered_features, possibly_inside
-from lardhm_torch.learning.clustering import (
-    MIN_COUNT,
-    Columns,
-    along_curve,
-    factor_covariances,
-    spread_rows,
-)
+from lardhm_torch.learning.clustering import MIN_COUNT, Columns, spread_rows
 from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
-from lardhm_torch.learning.parameters import MapState
+from lardhm_torch.learning.map_state import MapState, factor_covariances
+from lardhm_torch.points import in_morton_order
 
 INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
 KEPT = 0.25  # of a contradicted cluster's past
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence(Columns):
     """What weights learn from: N points with a target each, and how much each counts.
 
@@ -214,7 +209,7 @@ def learn(
         rng: random state.
     """
     batch_size = config.rows_a_batch(len(evidence))
-    points, *columns = along_curve(*evidence)
+    points, *columns = in_morton_order(*evidence)
     rows = torch.arange(len(points), device=points.device)
     order, labels, is_occupied, strength = deal_samples((rows, *columns), batch_size, rng)
     indices, values = ordered_features(

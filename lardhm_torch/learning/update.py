@@ -27,7 +27,6 @@ from lardhm_torch.learning.cluster_matching import (
 from lardhm_torch.learning.clustering import (
     MIN_COUNT,
     Clusters,
-    along_curve,
     cluster_classes,
     cluster_points,
     scan_clusters,
@@ -35,7 +34,7 @@ from lardhm_torch.learning.clustering import (
     split_clusters,
 )
 from lardhm_torch.learning.fitting import FitConfig
-from lardhm_torch.learning.parameters import MapState
+from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.replay import (
     around,
     contradicted,
@@ -47,6 +46,7 @@ from lardhm_torch.learning.replay import (
     recalled_evidence,
     spread_points,
 )
+from lardhm_torch.points import in_morton_order
 
 COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
 SMOOTHER = 2.0  # free space than surfaces: so many times the points before a cluster is too coarse
@@ -126,7 +126,7 @@ def updated(
     known = state.rows(nearby)
     classes = split_classes(points, labels > 0.5)
     if task.config.as_in_paper:
-        points, labels = along_curve(points, labels)
+        points, labels = in_morton_order(points, labels)
         new, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
         part = merge_clusters(
             known, new, is_occupied, task.config.zeta, task.kernel.min_lengthscale
@@ -211,7 +211,7 @@ def absorb(
     met = torch.cat([own[pooled], own[look.outgrown]])
     if len(look.rest) < MIN_COUNT:
         return part, met
-    (rest,) = along_curve(look.rest)
+    (rest,) = in_morton_order(look.rest)
     share = -(-num_clusters * len(rest) // len(points))
     new = cluster_points(rest, share, task.rng)
     new, where = _settle(known, new, look, task)

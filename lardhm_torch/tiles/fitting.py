@@ -25,7 +25,8 @@ from tqdm import tqdm
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.atomic_files import remove_partials, replaced_file
 from lardhm_torch.learning.fitting import FitConfig
-from lardhm_torch.learning.parameters import MapState, write_state
+from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.parameters import write_state
 from lardhm_torch.tiles.cluster_files import (
     clustered_points,
     clusters_path,
@@ -172,9 +173,11 @@ class _Job:
         weights, raw = train_tile(tile, own, self._around(index), self.budget, task)
         clusters = own.clusters
         model = LardHilbertMap(**self.manifest.settings).to(weights)
-        model.origin = torch.tensor(self._origin(index), device=self.device)
+        origin = torch.tensor(self._origin(index), device=self.device)
         moments = (clusters.counts, clusters.means, clusters.scatters)
-        write_state(model, MapState(weights, clusters.means, raw, own.is_occupied, *moments))
+        write_state(
+            model, MapState(weights, clusters.means, raw, own.is_occupied, *moments), origin
+        )
         path = self._fitted_path(index, ".pt")
         model.cpu().save(path)
         record = tile_record(model, path, self.ledger.tiles[index].core)

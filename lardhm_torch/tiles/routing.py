@@ -131,12 +131,14 @@ def _watched(pieces: Iterable[Scans], progress: bool) -> Iterator[Scans]:
 
 def _begin(path: Path, first: Scans, config: TilingConfig) -> Manifest:
     """The manifest of a new folder, or of one that was begun with the same settings."""
-    neighbors = {} if config.num_neighbors is None else {"num_neighbors": config.num_neighbors}
+    empty = LardHilbertMap(first.dim)
+    if config.num_neighbors is not None:
+        empty = LardHilbertMap(first.dim, config.num_neighbors)
     manifest = Manifest(
         edge=config.edge,
         halo=min(0.5, config.edge / 2) if config.halo is None else config.halo,
         origin=grid_origin(first.origins[0], config.edge),
-        settings=LardHilbertMap(first.dim, **neighbors).settings,
+        settings=empty.settings,
         sampling=asdict(config.sampling),
         fitting=asdict(config.fitting),
         seed=config.seed,

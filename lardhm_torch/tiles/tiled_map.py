@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch.hilbert_map import LardHilbertMap, check_axes, check_points
+from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.learning import posterior
+from lardhm_torch.points import check_axes, check_points
 from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number
 from lardhm_torch.tiles.manifest import Manifest, read_manifest
 from lardhm_torch.tiles.parts import Parts

@@ -25,12 +25,12 @@ from lardhm_torch.learning.clustering import (
     MIN_COUNT,
     POINTS_PER_CLUSTER,
     Clusters,
-    along_curve,
     cluster_each,
     concatenate_clusters,
-    factor_covariances,
 )
 from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
+from lardhm_torch.learning.map_state import factor_covariances
+from lardhm_torch.points import in_morton_order
 from lardhm_torch.tiles.samples import OCCUPIED, Counts, TilePoints
 
 # Clusters of best accuracy lie denser where points do, but less so: where there are twice the
@@ -97,7 +97,7 @@ def cluster_tile(
         rng: random state.
     """
     classes = [tile.core_points(label) for label in (OCCUPIED, 0)]
-    classes = [along_curve(points)[0] if len(points) else points for points in classes]
+    classes = [in_morton_order(points)[0] if len(points) else points for points in classes]
     return TileClusters(*cluster_each(classes, num_clusters, rng))
 
 
@@ -122,7 +122,7 @@ def train_tile(
     rows = max(LEAST_BATCH, len(tile.points) // 128)
     config = replace(task.config, batch_size=task.config.batch_size or rows)
     size = config.rows_a_batch(len(tile.points))
-    points, kind = along_curve(*tile)
+    points, kind = in_morton_order(*tile)
     order = torch.arange(len(kind), device=kind.device)
     order, kind = deal_samples((order, kind), size, task.rng)
     index = native.build_index(clusters.means, task.kernel.num_neighbors)

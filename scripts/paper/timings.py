@@ -25,13 +25,10 @@ from lardhm_torch.evaluation.baselines.local_gp import LocalGP
 from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline, to_array
 from lardhm_torch.evaluation.baselines.original_hilbert_map import OriginalHilbertMap
 from lardhm_torch.features import raw_factors
-from lardhm_torch.learning.clustering import (
-    along_curve,
-    clusters_about,
-    factor_covariances,
-    mini_batch_kmeans,
-)
+from lardhm_torch.learning.clustering import clusters_about, mini_batch_kmeans
 from lardhm_torch.learning.fitting import deal_samples, fit_weights
+from lardhm_torch.learning.map_state import factor_covariances
+from lardhm_torch.points import in_morton_order
 
 NUM_CLUSTERS, NUM_NEIGHBORS, RESOLUTION = 500, 5, 0.05
 NUM_POINTS, NUM_QUERIES = 82_842, 638_683
@@ -90,7 +87,7 @@ def _stages(local: Tensor, labels: Tensor, grid: Tensor, seed: int) -> dict[str,
         took[name] = took.get(name, 0.0) + time.perf_counter() - start
         return result
 
-    local, labels = timed("clustering", lambda: along_curve(local, labels))
+    local, labels = timed("clustering", lambda: in_morton_order(local, labels))
     parts = []
     for members in (local[labels > 0.5], local[labels <= 0.5]):
         count = NUM_CLUSTERS // 2

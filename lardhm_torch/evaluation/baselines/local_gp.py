@@ -18,9 +18,9 @@ from lardhm_torch.evaluation.baselines.gaussian_process import (
     squared_exponential,
     squash,
 )
-from lardhm_torch.hilbert_map import check_samples
-from lardhm_torch.learning.clustering import along_curve, mini_batch_kmeans
+from lardhm_torch.learning.clustering import mini_batch_kmeans
 from lardhm_torch.native import nearest_centers
+from lardhm_torch.points import check_samples, in_morton_order
 
 LEARNING_CLUSTERS = 32  # random ones of which the hyperparameters are learned,
 LEARNING_POINTS = 128  # from so many random points of each at most
@@ -76,7 +76,7 @@ class LocalGP:
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
         origin = points.mean(dim=0).round()
         local = (points - origin).to(self.dtype)
-        local, targets = along_curve(local, 2 * labels.to(self.dtype) - 1)
+        local, targets = in_morton_order(local, 2 * labels.to(self.dtype) - 1)
         centers = mini_batch_kmeans(local, max(1, len(local) // self.points_per_cluster), rng)
         members = _members(local, centers, rng)
         centers = centers[

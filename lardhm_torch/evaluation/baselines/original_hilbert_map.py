@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch.hilbert_map import check_samples
-from lardhm_torch.learning.clustering import along_curve
 from lardhm_torch.learning.fitting import FitConfig, deal_samples, fit_weights
+from lardhm_torch.points import check_samples, in_morton_order
 
 REACH = 2.5  # [cells] kernels end here, at exp(-2.5^2 / 2) = 4 % for a lengthscale of one cell
 MAX_CELLS = 1 << 28
@@ -75,7 +74,7 @@ class OriginalHilbertMap:
         self.offsets = self._neighbor_offsets(points.shape[1]).to(points.device)
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
 
-        samples = along_curve(points, labels.to(self.dtype))
+        samples = in_morton_order(points, labels.to(self.dtype))
         points, labels = deal_samples(samples, self.config.rows_a_batch(len(points)), rng)
 
         def features_of(rows: slice) -> tuple[Tensor, Tensor]:

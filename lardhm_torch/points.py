@@ -1,0 +1,150 @@
+"""Positions on their way into a map: checked, in the map's frame, in Morton order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+
+CHECK_CHUNK = 1 << 18  # labels checked at a time, so that the check needs little memory
+FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
+
+
+class TrainingPoints(NamedTuple):
+    """(N, D) points in the map's frame [m], (N,) labels, and the frame's origin (D,) float64 [m]."""
+
+    points: Tensor
+    labels: Tensor
+    origin: Tensor
+
+
+def training_points(
+    points: Tensor, labels: Tensor, like: Tensor, origin: Tensor | None = None
+) -> TrainingPoints:
+    """Checked samples in a map's frame and dtype; in Morton order where the frame is new.
+
+    Args:
+        points: (N, D) world positions [m], at least one.
+        labels: (N,) 1 occupied, 0 free.
+        like: (M, D) tensor of the map, for its dimension, dtype and device.
+        origin: (D,) float64, the map's origin [m]. None: a new frame around the points, in whole
+            meters, with the points sorted along the Morton curve.
+
+    Raises:
+        ValueError: as `check_samples`.
+    """
+    points, labels = check_samples(points, labels, like.shape[1], like.device)
+    labels = labels.to(like.dtype)
+    if origin is not None:
+        return TrainingPoints(to_map_frame(points, origin, like.dtype), labels, origin)
+    origin = points.mean(dim=0, dtype=torch.float64).round()
+    local = to_map_frame(points, origin, like.dtype)
+    local, labels = in_morton_order(local, labels)
+    return TrainingPoints(local, labels, origin)
+
+
+def check_samples(
+    points: Tensor, labels: Tensor, dim: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Samples as (N, D) points and (N,) labels on a device; arrays and lists are converted.
+
+    Raises:
+        ValueError: wrong shapes, no points, NaN or infinite points, or labels not 0 or 1.
+    """
+    points, labels = as_tensor(points, device).detach(), as_tensor(labels, device).detach()
+    if points.ndim != 2 or points.shape[1] != dim:
+        raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
+    if labels.shape != points.shape[:1]:
+        raise ValueError(
+            f"labels must be ({len(points)},), one per point; got {tuple(labels.shape)}"
+        )
+    if len(points) == 0:
+        raise ValueError("points must hold at least one point; got 0")
+    # The sum needs no memory and is finite only if every coordinate is.
+    bad = points.new_zeros(0) if bool(points.sum().isfinite()) else ~points.isfinite().all(dim=1)
+    if bool(bad.any()):
+        raise ValueError(
+            f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
+            f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
+        )
+    strange = next((c for c in labels.split(CHECK_CHUNK) if not _zeros_and_ones(c)), None)
+    if strange is not None:
+        value = strange[(strange != 0) & (strange != 1)][0].item()
+        cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
+        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
+    return points, labels
+
+
+def _zeros_and_ones(values: Tensor) -> bool:
+    """Whether all values are 0 or 1: only 0, 1 and infinity equal their square."""
+    return torch.equal(values * values, values) and bool(values.sum() <= len(values))
+
+
+def in_morton_order(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
+    """(N, D) points and (N, ...) columns that belong to them, sorted by `morton_order`.
+
+    Neighbors in space are then close in memory, which speeds up everything that follows.
+    """
+    order = morton_order(points)
+    return tuple(column.index_select(0, order) for column in (points, *columns))
+
+
+def morton_order(points: Tensor) -> Tensor:
+    """(N, D) positions -> (N,) int64 rows in the order of their Morton codes."""
+    if native.supports(points):
+        return torch.ops.lardhm.z_order(points)
+    bits = min(10, 62 // points.shape[1])
+    lower, upper = points.amin(dim=0), points.amax(dim=0)
+    edge = (upper - lower).max().clamp(min=torch.finfo(points.dtype).tiny)
+    cells = ((points - lower) / edge * (2**bits - 1)).long()
+    code = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    for bit in range(bits):
+        for axis in range(points.shape[1]):
+            code |= ((cells[:, axis] >> bit) & 1) << (bit * points.shape[1] + axis)
+    return code.argsort(stable=True)
+
+
+def as_tensor(values: Any, device: torch.device) -> Tensor:
+    """A tensor, array or list as a tensor on the device; Python numbers become float64."""
+    if not isinstance(values, (Tensor, np.ndarray)):
+        values = np.asarray(values)
+    return torch.as_tensor(values, device=device)
+
+
+def check_points(points: Tensor, dim: int) -> None:
+    """Raise a ValueError if points are not (..., D)."""
+    if points.ndim == 0 or points.shape[-1] != dim:
+        raise ValueError(
+            f"points must be (..., {dim}), one row of coordinates per point; "
+            f"got {tuple(points.shape)}"
+        )
+
+
+def check_axes(axes: Sequence[Tensor], dim: int) -> None:
+    """Raise a ValueError if axes are not D lists of finite coordinates."""
+    if len(axes) != dim:
+        raise ValueError(f"axes must be {dim} lists of coordinates; got {len(axes)}")
+    if not all(bool(axis.isfinite().all()) for axis in axes):
+        raise ValueError("axes must be finite; got NaN or infinity")
+
+
+def to_map_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
+    """(..., D) world positions -> positions relative to an origin in whole meters, in that dtype.
+
+    Whole meters are exact in float32 too, so float32 points lose nothing.
+    """
+    working = torch.promote_types(torch.promote_types(points.dtype, dtype), torch.float32)
+    shift = origin.to(working)
+    plain = working == dtype or points.ndim != 2 or points.requires_grad
+    if plain or torch.compiler.is_compiling():
+        return (points.to(working) - shift).to(dtype)
+    local = points.new_empty(points.shape, dtype=dtype)  # in chunks: no large temporary
+    shift = shift.expand(min(FRAME_CHUNK, len(points)), -1).contiguous()
+    for to, part in zip(local.split(FRAME_CHUNK), points.split(FRAME_CHUNK), strict=True):
+        to.copy_(part - shift[: len(part)])
+    return local
