@@ -89,7 +89,7 @@ def test_held_out_rays_do_not_train_even_when_sampled_anew():
     model, points, labels = fitted()
     ray_id = torch.arange(len(points)) % 50
     liar, config = copy.deepcopy(model), TuneConfig(epochs=3, hold_out=0.3)
-    held = _hold_out(LabelledPoints(points, labels, ray_id), 0.3, torch.Generator().manual_seed(0))
+    held = _hold_out(LabelledPoints(points, labels, ray_id), 0.3, seeded_generator(0, "fine_tune"))
     assert 5 < len(held) < 30
     lies = torch.where(torch.isin(ray_id, held), 1 - labels, labels)
     ends, epochs = [], []

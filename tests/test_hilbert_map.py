@@ -272,9 +272,7 @@ def test_queries_of_the_wrong_shape_and_cluster_numbers_below_one_are_refused():
         model(torch.zeros(4, 2))
     with pytest.raises(ValueError, match=r"points must be \(N, 3\); got \(3,\)"):
         model.features(torch.zeros(3))
-    with pytest.raises(
-        ValueError, match=r"num_clusters must be a whole number.*; got 0"
-    ):
+    with pytest.raises(ValueError, match=r"num_clusters must be a whole number.*; got 0"):
         model.fit(*wall(), num_clusters=0)
 
 

@@ -298,9 +298,7 @@ def test_bad_samples_are_refused_and_the_map_is_as_it_was(points, labels, messag
     before = copy.deepcopy(model)
     with pytest.raises(ValueError, match=message):
         model.update(points, labels)
-    with pytest.raises(
-        ValueError, match=r"num_clusters must be a whole number.*; got 0"
-    ):
+    with pytest.raises(ValueError, match=r"num_clusters must be a whole number.*; got 0"):
         model.update(*wall(), num_clusters=0)
     assert same_map(model, before)
 
