@@ -6,6 +6,7 @@ import torch
 from lardhm_torch import LardHilbertMap, Samples, TuneConfig, fine_tune
 from lardhm_torch.io.map_files import load_state, save_state
 from lardhm_torch.learning.fine_tuning import LabelledPoints, _hold_out, batches
+from lardhm_torch.sampling import seeded_generator
 
 F64 = torch.float64
 
