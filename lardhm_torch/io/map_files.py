@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from safetensors import torch as safetensors_torch
@@ -29,6 +29,7 @@ from lardhm_torch.io.atomic_files import replaced_file
 FORMAT_VERSION = 1
 STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
 SAFETENSORS = ".safetensors"
+MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it
 
 
 def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
@@ -126,14 +127,22 @@ def _without_reserve(value: Any) -> Any:
 
 def _read_torch(path: Path) -> Any:
     with open(path, "rb") as file:
-        with zipfile.ZipFile(file) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise ValueError(f"the checksum of its entry {damaged} differs: the file is damaged")
+        _verify_zip(file)
         file.seek(0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about pickle protocols; the error is enough
             return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _verify_zip(file: BinaryIO) -> None:
+    """A ValueError where a checksum differs, or torch would take an entry for an empty folder."""
+    with zipfile.ZipFile(file) as archive:
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"the checksum of its entry {damaged} differs: the file is damaged")
+        for entry in archive.infolist():
+            if entry.external_attr & MSDOS_DIRECTORY:
+                raise ValueError(f"its entry {entry.filename} must be a file, not a folder")
 
 
 def _write_safetensors(state: Mapping[str, Any], path: Path) -> None:
