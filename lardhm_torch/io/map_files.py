@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
+from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 from torch import Tensor
 
@@ -96,9 +97,12 @@ def decode_safetensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str
     """Tensors and metadata in the bytes of a ``.safetensors`` file; the checksum is not verified.
 
     Raises:
-        ValueError, safetensors.SafetensorError: the bytes are not such a file.
+        ValueError: the bytes are not such a file.
     """
-    tensors = safetensors_torch.load(content)
+    try:
+        tensors = safetensors_torch.load(content)
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
     header_end = 8 + int.from_bytes(content[:8], "little")
     return tensors, json.loads(content[8:header_end]).get("__metadata__", {})
 
@@ -172,5 +176,5 @@ def _checksum(tensors: Mapping[str, Tensor], other: Mapping[str, str]) -> str:
     described = [[name, str(tensors[name].dtype), list(tensors[name].shape)] for name in names]
     value = zlib.crc32(json.dumps([described, sorted(other.items())]).encode())
     for name in names:
-        value = zlib.crc32(tensors[name].reshape(-1).view(torch.uint8).numpy(), value)
+        value = zlib.crc32(tensors[name].reshape(-1).view(torch.uint8).numpy().data, value)
     return f"{value:08x}"
