@@ -1,6 +1,7 @@
 import json
 import os
 import pickle
+import stat
 
 import pytest
 import torch
@@ -109,6 +110,16 @@ def test_a_map_of_real_scans_comes_back_from_safetensors(data, safe_path):
     model.save(safe_path)
     points = samples.points[::50]
     assert torch.equal(LardHilbertMap.load(safe_path)(points), model(points))
+
+
+def test_who_may_read_a_map_follows_the_umask(safe_path, path):
+    before = os.umask(0o027)
+    try:
+        for target in (safe_path, path):
+            some_map().save(target)
+            assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    finally:
+        os.umask(before)
 
 
 def test_other_programs_find_the_settings_as_json(safe_path):

@@ -157,7 +157,8 @@ def _write_safetensors(state: Mapping[str, Any], path: Path) -> None:
     }
     other = {name: json.dumps(value) for name, value in state.items() if name not in tensors}
     metadata = {"format": "pt", "checksum": _checksum(tensors, other), **other}
-    safetensors_torch.save_file(tensors, path, metadata=metadata)
+    # `save_file` would replace the file by one that only its owner can read.
+    path.write_bytes(safetensors_torch.save(tensors, metadata))
 
 
 def _read_safetensors(path: Path) -> dict[str, Any]:
