@@ -2,7 +2,7 @@
 # make test   set-up, checks and tests
 # make docs   set-up and the documentation (out/docs/index.html); a warning is an error
 # make bench  set-up and the benchmarks (minutes)
-# make soak   set-up and the long checks: fuzzing, kills (tens of minutes)
+# make soak   set-up and the long checks: fuzzing, flipped bits, kills (tens of minutes)
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -40,5 +40,6 @@ bench: .venv/bench
 
 soak: .venv/ready
 	$(BIN)/python scripts/fuzz_readers.py
+	$(BIN)/python scripts/soak_bits.py --flips 1000 --seed 0
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0
 	$(BIN)/python scripts/soak_tiles.py --kills 20 --seed 0

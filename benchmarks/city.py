@@ -28,10 +28,11 @@ from torch import Tensor
 
 from lardhm_torch import LardHilbertMap, Scans
 from lardhm_torch.tiles.fitting import fit_tiles
+from lardhm_torch.tiles.ledger import Ledger
 from lardhm_torch.tiles.manifest import read_manifest
 from lardhm_torch.tiles.ranks import one_thread
+from lardhm_torch.tiles.records import read_records, unpack
 from lardhm_torch.tiles.routing import TilingConfig, tile_scans
-from lardhm_torch.tiles.samples import Ledger, read_records, unpack
 
 PITCH = 60.0  # [m] from street to street
 STREET = 7.0  # [m] from the middle of a street to the houses
@@ -146,7 +147,7 @@ def single_fits(folder: Path, ledger: Ledger) -> tuple[float, float]:
     for place in range(SINGLE_TILES):  # spread over all points, not over all tiles
         chosen = _at_share(ledger, ranked, (place + 0.5) / SINGLE_TILES)
         start = time.process_time()
-        records = read_records(folder, chosen, ledger.tiles[chosen], manifest.dim, 1 << 23)
+        records = read_records(folder, chosen, sum(ledger.tiles[chosen]), manifest.dim, 1 << 23)
         tile = unpack(records, torch.device("cpu"), torch.float32)
         points, labels = tile.points[tile.in_core], tile.labels[tile.in_core]
         read = time.process_time()

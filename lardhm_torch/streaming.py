@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io import map_files
+from lardhm_torch.io.atomic_files import remove_partials
 from lardhm_torch.learning.clustering import scan_clusters, split_classes
 from lardhm_torch.learning.update import UpdateConfig
 from lardhm_torch.sampling import (
@@ -134,7 +133,7 @@ def stream_scans(
 def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progress]:
     """The map of a checkpoint and how much of the stream is in it.
 
-    What a killed run left half-written beside the checkpoint is removed.
+    Incomplete temporary files that a killed run left beside the checkpoint are removed.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -146,11 +145,7 @@ def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progres
     ):
         raise ValueError(f"{os.fspath(path)} must be the checkpoint of a stream; it is another map")
     model = LardHilbertMap.load(path)
-    target = Path(path)
-    leftover = re.compile(re.escape(f".{target.name}.") + r"[a-z0-9_]{8}")
-    for file in target.parent.iterdir():
-        if leftover.fullmatch(file.name):
-            file.unlink()
+    remove_partials(path)
     return model, Progress(found["scans"], found["rays"])
 
 

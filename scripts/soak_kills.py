@@ -77,6 +77,8 @@ def run_killed(files: list[Path], target: Path, kills: int, rng: random.Random) 
                 process.communicate()
                 killed += 1
                 _, done = resume_stream(target)  # the file is whole
+                if left := list(target.parent.glob(f".*.{target.name}")):
+                    sys.exit(f"kill {killed}: {left[0]} was left behind")
                 if done.scans < before:
                     sys.exit(f"kill {killed}: {before} scans became {done.scans}")
                 if done.scans == before:

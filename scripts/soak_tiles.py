@@ -62,7 +62,7 @@ def finished(folder: Path) -> set[str]:
     """What need not be done again: clusters of tiles, fitted tiles, tiles taken over."""
     marks = {f"clusters {path.name}" for path in (folder / "clusters").glob("[!.]*")}
     marks |= {f"fitted {path.stem}" for path in (folder / "fitted").glob("[!.]*.json")}
-    return marks | {f"fitted {path.stem}" for path in (folder / "tiles").glob("[!.]*.pt")}
+    return marks | {f"fitted {path.stem}" for path in (folder / "tiles").glob("[!.]*.safetensors")}
 
 
 def kill(process: subprocess.Popen[bytes], everyone: bool, rng: random.Random) -> None:

@@ -1,9 +1,12 @@
 import os
+import signal
 import stat
+import subprocess
+import sys
 
 import pytest
 
-from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.io.atomic_files import remove_partials, replaced_file
 
 
 @pytest.fixture
@@ -67,3 +70,43 @@ def test_a_place_that_cannot_be_written_to_is_named(tmp_path):
         pass
     with pytest.raises(IsADirectoryError, match="is a folder"), replaced_file(tmp_path):
         pass
+
+
+WRITER = """
+import sys, time
+from lardhm_torch.io.atomic_files import replaced_file
+
+with replaced_file(sys.argv[1]) as partial:
+    partial.write_bytes(b"half")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def kill_writer(path):
+    process = subprocess.Popen([sys.executable, "-c", WRITER, path], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"writing\n"
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def test_what_a_killed_writer_leaves_is_found_and_removed(path):
+    (path.parent / "link.pt").symlink_to(path)
+    others = {"link.pt", "map.pt", ".map.pt.backup", ".notes", ".0123abcd.map.pt.txt"}
+    for name in others - {"link.pt", "map.pt"}:
+        (path.parent / name).write_text("of someone else")
+    for named in (path, path.parent / "link.pt"):
+        kill_writer(named)
+        assert path.read_bytes() == b"old"
+        assert len(list(path.parent.iterdir())) == len(others) + 1
+        remove_partials(named)
+        assert {file.name for file in path.parent.iterdir()} == others
+
+
+def test_the_partial_files_of_a_whole_folder_are_removed(path):
+    kill_writer(path)
+    kill_writer(path.with_name("other.json"))
+    (path.parent / "folder").mkdir()
+    assert len(list(path.parent.iterdir())) == 4
+    remove_partials(path.parent)
+    assert {file.name for file in path.parent.iterdir()} == {"map.pt", "folder"}

@@ -1,7 +1,7 @@
 import json
 import os
 import pickle
-import sys
+import stat
 
 import pytest
 import torch
@@ -17,7 +17,6 @@ def path(tmp_path):
 
 @pytest.fixture
 def safe_path(tmp_path):
-    pytest.importorskip("safetensors", reason="safetensors is not installed (extra io)")
     return tmp_path / "map.safetensors"
 
 
@@ -113,6 +112,16 @@ def test_a_map_of_real_scans_comes_back_from_safetensors(data, safe_path):
     assert torch.equal(LardHilbertMap.load(safe_path)(points), model(points))
 
 
+def test_who_may_read_a_map_follows_the_umask(safe_path, path):
+    before = os.umask(0o027)
+    try:
+        for target in (safe_path, path):
+            some_map().save(target)
+            assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    finally:
+        os.umask(before)
+
+
 def test_other_programs_find_the_settings_as_json(safe_path):
     from safetensors import safe_open
 
@@ -149,13 +158,54 @@ def test_safetensors_without_settings_are_refused(safe_path):
             LardHilbertMap.load(safe_path)
 
 
-def test_without_safetensors_the_error_names_the_extra(path, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "safetensors", None)
-    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
-    target = tmp_path / "map.safetensors"
-    with pytest.raises(ImportError, match=r"lardhm_torch\[io\]"):
-        LardHilbertMap().save(target)
-    assert not target.exists()
-    target.write_bytes(b"{}")
-    with pytest.raises(ImportError, match=r"lardhm_torch\[io\]"):
-        LardHilbertMap.load(target)
+def test_safetensors_without_a_checksum_are_refused(safe_path):
+    from safetensors.torch import save_file
+
+    state = some_map().state_dict()
+    save_file(state, safe_path, {"_extra_state": json.dumps(state.pop("_extra_state"))})
+    with pytest.raises(ValueError, match=r"map\.safetensors must be.*must hold a checksum"):
+        LardHilbertMap.load(safe_path)
+
+
+def test_a_checksum_covers_names_types_and_settings(safe_path):
+    """Changes that leave every byte of the tensors as it was."""
+    from safetensors import safe_open
+    from safetensors.torch import load_file, save_file
+
+    some_map().save(safe_path)
+    with safe_open(safe_path, "pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(safe_path)
+    swapped = {
+        **tensors,
+        "posterior_means": tensors["weights"],
+        "weights": tensors["posterior_means"],
+    }
+    cast = {**tensors, "counts": tensors["counts"].view(torch.float64)}
+    other = {**metadata, "_extra_state": metadata["_extra_state"].replace("3", "4")}
+    for changed, said in ((swapped, metadata), (cast, metadata), (tensors, other)):
+        save_file(changed, safe_path, said)
+        with pytest.raises(ValueError, match="the checksum of its content differs"):
+            LardHilbertMap.load(safe_path)
+    save_file(tensors, safe_path, metadata)
+    LardHilbertMap.load(safe_path)
+
+
+def test_the_checksum_of_torch_files_is_written_whatever_the_option_says(path):
+    torch.serialization.set_crc32_options(False)
+    try:
+        some_map().save(path)
+        assert not torch.serialization.get_crc32_options()
+    finally:
+        torch.serialization.set_crc32_options(True)
+    LardHilbertMap.load(path)
+
+
+def test_a_damaged_entry_of_a_torch_file_is_named(path):
+    model = some_map()
+    torch.save(model.state_dict(), path)
+    content = path.read_bytes()
+    weights = model.weights.detach().numpy().tobytes()
+    path.write_bytes(content.replace(weights, bytes([weights[0] ^ 1]) + weights[1:]))
+    with pytest.raises(ValueError, match=r"map\.pt must be.*checksum of its entry map/data/\d+"):
+        LardHilbertMap.load(path)

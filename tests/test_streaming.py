@@ -79,11 +79,13 @@ def test_a_stream_that_stopped_goes_on_to_the_very_same_map(folder, whole, tmp_p
         stream_scans(LardHilbertMap(), breaks(), path=path)
     except KeyboardInterrupt:
         assert stop < 9
-    (tmp_path / ".map.pt.abc_4567").write_bytes(b"half a map")
+    (tmp_path / ".abcd4567.map.pt").write_bytes(b"half a map")
     (tmp_path / ".map.pt.backup").write_bytes(b"mine")
+    (tmp_path / ".abcd4567.other.pt").write_bytes(b"of another writer")
     model, done = resume_stream(path)
     assert done.scans == stop
-    assert {file.name for file in tmp_path.iterdir()} == {"map.pt", ".map.pt.backup"}
+    left = {file.name for file in tmp_path.iterdir()}
+    assert left == {"map.pt", ".map.pt.backup", ".abcd4567.other.pt"}
     assert stream_scans(model, iter_scans(folder), path=path, done=done).scans == 9
     assert same_map(LardHilbertMap.load(path), LardHilbertMap.load(whole))
 
@@ -238,5 +240,6 @@ def test_a_stream_killed_at_any_moment_ends_as_if_it_had_not_been(folder, whole,
         process.send_signal(signal.SIGKILL)
         process.communicate()
         resume_stream(path)  # the file is whole
+        assert list(tmp_path.iterdir()) == [path]
     assert process.returncode == 0
     assert same_map(LardHilbertMap.load(path), LardHilbertMap.load(whole))

@@ -24,13 +24,12 @@ from lardhm_torch import (
 )
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.tiles import fitting
-from lardhm_torch.tiles.cluster_files import clusters_path
 from lardhm_torch.tiles.fitting import fit_tiles
+from lardhm_torch.tiles.indexing import clusters_path, tile_path
+from lardhm_torch.tiles.ledger import Counts, read_ledger
 from lardhm_torch.tiles.manifest import read_manifest, write_manifest
-from lardhm_torch.tiles.places import tile_path
 from lardhm_torch.tiles.ranks import Ranks, one_thread
 from lardhm_torch.tiles.routing import TilingConfig, add_scans, tile_scans
-from lardhm_torch.tiles.samples import Counts, read_ledger
 from lardhm_torch.tiles.tiled_map import TiledMap
 from lardhm_torch.tiles.training import make_budget
 

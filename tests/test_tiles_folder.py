@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -14,14 +13,13 @@ from tiled_maps import F64, border_points, random_map, tiled
 
 from lardhm_torch import LardHilbertMap, TiledMap, cli, save_scans, simulate_room
 from lardhm_torch.cli import main
-from lardhm_torch.io.map_files import load_state
-from lardhm_torch.tiles import grouping
-from lardhm_torch.tiles.entries import tile_record
-from lardhm_torch.tiles.grouping import rows_by_number
+from lardhm_torch.io.map_files import load_state, save_state
+from lardhm_torch.tiles import blocks
+from lardhm_torch.tiles.blocks import rows_by_number
+from lardhm_torch.tiles.entries import file_checksum, tile_record
+from lardhm_torch.tiles.indexing import tile_indices, tile_name, tile_path
 from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
-from lardhm_torch.tiles.places import tile_indices, tile_name, tile_path
 from lardhm_torch.tiles.store import DamagedTileError
-from lardhm_torch.tiles.tile_bytes import read_tensors
 from lardhm_torch.tiles.tiled_map import open_map
 
 SETTINGS = LardHilbertMap().settings
@@ -29,8 +27,8 @@ SETTINGS = LardHilbertMap().settings
 
 def a_manifest(model_folder):
     model = random_map(clusters=20)
-    model.save(model_folder / "one.pt")
-    tile = tile_record(model, model_folder / "one.pt", 77)
+    model.save(model_folder / "one.safetensors")
+    tile = tile_record(model, model_folder / "one.safetensors", 77)
     return Manifest(
         edge=4.0,
         halo=6.5,
@@ -51,7 +49,7 @@ def test_a_manifest_written_and_read_is_the_same(tmp_path):
     manifest = a_manifest(tmp_path)
     write_manifest(tmp_path, manifest)
     assert read_manifest(tmp_path) == manifest
-    assert {path.name for path in tmp_path.iterdir()} == {"one.pt", "manifest.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {"one.safetensors", "manifest.json"}
 
 
 def test_a_tile_is_named_by_its_index_and_points_belong_to_one():
@@ -98,8 +96,8 @@ BAD_FIELDS = [
     ("settings", {**SETTINGS, "covariance_scale": 0.0}, "settings.covariance_scale must be > 0"),
     ("sampling", [], "sampling must be a table"),
     ("tiles", [], "tiles must be a table"),
-    ("tiles", {"../../x": {}}, "tile '../../x': a tile's name must be whole numbers"),
-    ("tiles", {"1_2_03": {}}, "tile '1_2_03': a tile's name must be its index"),
+    ("tiles", {"../../x": {}}, "tile '../../x': the name of a tile must be whole numbers"),
+    ("tiles", {"1_2_03": {}}, "tile '1_2_03': the name of a tile must be its index"),
     ("tiles", {"1_2_3": {}}, "tile '1_2_3': a tile must have"),
     ("more", 1, "unknown=.'more'."),
 ]
@@ -107,13 +105,13 @@ BAD_FIELDS = [
 
 def rewrite(folder, change):
     """Edit the manifest's body by hand and make its checksum right again."""
-    from lardhm_torch.tiles.manifest import _body_checksum
+    from lardhm_torch.tiles.manifest import body_checksum
 
     path = folder / "manifest.json"
     page = json.loads(path.read_text())
-    change(page["map"])
+    change(page["content"])
     with contextlib.suppress(ValueError):  # for what is no JSON there is no checksum
-        page["checksum"] = _body_checksum(page["map"])
+        page["checksum"] = body_checksum(page["content"])
     path.write_text(json.dumps(page))
 
 
@@ -132,7 +130,7 @@ def test_a_bad_field_is_named(field, value, message, tmp_path):
         ("checksum", "abc", "checksum must be 64 hexadecimal digits; got 'abc'"),
         ("num_points", -1, "num_points must be 0 or more; got -1"),
         ("num_clusters", 0, "num_clusters must be 1 or more; got 0"),
-        ("reach", None, "reach must be a finite number"),
+        ("support_radius", None, "support_radius must be a finite number"),
         ("bounds", [[0, 0, 0]], "bounds must be a lower and an upper corner"),
         ("bounds", [[0, 0, 1], [0, 0, 0]], "bounds must be lower <= upper"),
         ("bounds", [[0, 0], [1, 1]], "bounds of tile 3_-1_0 must have 3 coordinates"),
@@ -155,13 +153,13 @@ def test_other_files_are_not_taken_for_a_manifest(tmp_path):
     with pytest.raises(FileNotFoundError, match="must be the folder of a tiled map"):
         read_manifest(tmp_path)
     for text, message in [
-        ("", "must be JSON"),
-        ("[" * 100_000, "must be JSON"),
-        ("[]", "format_version must be 2; got None"),
-        ('{"format_version": 3}', "got 3. A newer map needs a newer lardhm_torch"),
-        ('{"format_version": 1}', "got 1. .*an older folder must be made anew"),
-        ('{"format_version": 2, "map": 3}', "map must be a table; got int"),
-        ('{"format_version": 2, "map": {}}', "the file was damaged or edited"),
+        ("", "manifest.json must be the manifest of a tiled map; it must be JSON"),
+        ("[" * 100_000, "manifest.json must be the manifest of a tiled map; it must be JSON"),
+        ("[]", "format_version must be 3; got None"),
+        ('{"format_version": 4}', "got 4. A newer folder needs a newer lardhm_torch"),
+        ('{"format_version": 2}', "got 2. .*an older one must be tiled and fitted again"),
+        ('{"format_version": 3, "content": 3}', "content must be a table; got int"),
+        ('{"format_version": 3, "content": {}}', "the file was damaged or edited"),
     ]:
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -211,7 +209,7 @@ def test_a_damaged_tile_can_be_skipped(tmp_path, monkeypatch):
     points, index = border_points(whole, 2000), (0, 0, 0)
     damage(tile_path(whole.folder, index), "cut short")
     tiles = TiledMap.open(whole.folder, skip_damaged=True)
-    with pytest.warns(UserWarning, match="went on without a tile: tile 0_0_0"):
+    with pytest.warns(UserWarning, match="a damaged tile was skipped: tile 0_0_0"):
         found = tiles(points)
     manifest = read_manifest(whole.folder)
     without = {place: tile for place, tile in manifest.tiles.items() if place != index}
@@ -242,7 +240,29 @@ def test_a_tile_that_is_not_what_the_manifest_says_is_an_error(
         TiledMap.open(tiles.folder).merge()
 
 
-def test_a_map_without_tiles_says_nothing(tmp_path):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state.pop("means"), r"must hold the tensors of a map; missing: \['means'\]"),
+        (lambda state: state.update(counts=state["counts"].int()), "counts must be .* torch.int64"),
+        (lambda state: state.update(means=state["means"][:1]), r"means must be \(\d+, 3\)"),
+        (lambda state: state.pop("_extra_state"), "must hold the map's format version"),
+    ],
+)
+def test_a_tile_with_other_tensors_is_an_error(change, message, tmp_path, monkeypatch):
+    tiles = tiled(random_map(), tmp_path, monkeypatch)
+    index, entry = next(iter(tiles.manifest.tiles.items()))
+    path = tile_path(tiles.folder, index)
+    state = load_state(path)
+    change(state)
+    save_state(state, path)
+    changed = {**tiles.manifest.tiles, index: replace(entry, checksum=file_checksum(path))}
+    write_manifest(tiles.folder, replace(tiles.manifest, tiles=changed))
+    with pytest.raises(DamagedTileError, match=message):
+        TiledMap.open(tiles.folder).merge()
+
+
+def test_a_map_without_tiles_has_probability_one_half(tmp_path):
     write_manifest(tmp_path, Manifest(edge=1.0, origin=(0.0,) * 3, settings=SETTINGS))
     tiles = TiledMap.open(tmp_path)
     assert len(tiles) == 0
@@ -251,69 +271,13 @@ def test_a_map_without_tiles_says_nothing(tmp_path):
     assert "0 tiles" in repr(tiles)
 
 
-# --- the bytes of tiles ---
-
-
-def tile_files(folder):
-    """Map files of both dtypes, saved in all ways, of one cluster and more, and an empty one."""
-    for number, (clusters, dtype) in enumerate([(0, F64), (1, F64), (7, torch.float32)]):
-        model = random_map(clusters=clusters, dtype=dtype) if clusters else LardHilbertMap()
-        model.save(folder / f"{number}.pt")
-        torch.save(model.state_dict(), folder / f"{number}_by_hand.pt")
-    return sorted(folder.glob("*.pt"))
-
-
-def test_tensors_are_read_from_bytes_as_torch_reads_them(tmp_path):
-    for path in tile_files(tmp_path):
-        ours, theirs = read_tensors(bytearray(path.read_bytes())), load_state(path)
-        assert ours.keys() == theirs.keys()
-        for name, value in theirs.items():
-            if isinstance(value, torch.Tensor):
-                assert ours[name].dtype == value.dtype
-                assert torch.equal(ours[name], value)
-            else:
-                assert ours[name] == value
-
-
-class Harm:
-    """What pickles as a call of a function."""
-
-    def __reduce__(self):
-        return os.mkdir, ("harmed",)
-
-
-def test_what_is_no_usual_map_file_is_left_to_torch_and_nothing_in_it_is_called(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    whole = torch.arange(6.0)
-    others = [{"weights": Harm()}, {"weights": whole[1:3]}, {"weights": whole.reshape(2, 3).T}, 3]
-    for number, other in enumerate([*others, {"weights": whole.half()}]):
-        torch.save(other, f"{number}.pt")
-        assert read_tensors(bytearray((tmp_path / f"{number}.pt").read_bytes())) is None
-    assert not (tmp_path / "harmed").exists()
-    assert read_tensors(bytearray(b"no zip file")) is None
-
-
-@settings(deadline=None, max_examples=150)
-@given(where=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255), cut=st.booleans())
-def test_damaged_bytes_are_never_an_error_of_another_kind(tmp_path_factory, where, flip, cut):
-    path = tmp_path_factory.mktemp("damaged") / "one.pt"
-    random_map(clusters=5).save(path)
-    content = bytearray(path.read_bytes())
-    place = int(where * len(content))
-    content[place] ^= flip
-    found = read_tensors(content[:place] if cut else content)
-    assert found is None or isinstance(found, dict)
-
-
 # --- groups of points ---
 
 
 @given(numbers=st.lists(st.integers(-1, 3), max_size=30))
 def test_every_row_is_in_the_group_of_its_number(numbers):
     monkeypatch = pytest.MonkeyPatch()
-    monkeypatch.setattr(grouping, "SORTED_AT_ONCE", 7)
+    monkeypatch.setattr(blocks, "SORTED_AT_ONCE", 7)
     numbers = torch.tensor(numbers, dtype=torch.int32)
     seen = torch.full_like(numbers, -1)
     for number, rows in rows_by_number(numbers):

@@ -10,10 +10,10 @@ from lardhm_torch import LardHilbertMap, Scans, save_scans
 from lardhm_torch.cli import main
 from lardhm_torch.tiles.fitting import fit_tiles
 from lardhm_torch.tiles.folders import join_folders
+from lardhm_torch.tiles.indexing import tile_path
+from lardhm_torch.tiles.ledger import read_ledger
 from lardhm_torch.tiles.manifest import read_manifest, write_manifest
-from lardhm_torch.tiles.places import tile_path
 from lardhm_torch.tiles.routing import TilingConfig, tile_scans
-from lardhm_torch.tiles.samples import read_ledger
 from lardhm_torch.tiles.tiled_map import TiledMap
 
 FAR = torch.tensor([20 * EDGE, 0.0, 0.0], dtype=torch.float64)  # whole tiles
@@ -86,7 +86,7 @@ def test_folders_that_do_not_fit_together_are_refused(tmp_path):
         join_folders(first, tmp_path / "coarse", tmp_path / "joined")
     manifest = read_manifest(second)
     write_manifest(second, replace(manifest, origin=(0.3, *manifest.origin[1:])))
-    with pytest.raises(ValueError, match="borders of tiles in the same places"):
+    with pytest.raises(ValueError, match="tile borders at the same positions"):
         join_folders(first, second, tmp_path / "joined")
     with pytest.raises(ValueError, match="new or empty folder"):
         join_folders(first, first, second)

@@ -21,9 +21,10 @@ from lardhm_torch.queries.grids import map_bounds, occupancy_gradient, query_gri
 from lardhm_torch.queries.raycasting import surface_step, thickness_counts
 from lardhm_torch.scans import split_rays
 from lardhm_torch.tiles import layout
+from lardhm_torch.tiles.indexing import tile_indices
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
-from lardhm_torch.tiles.places import tile_indices
-from lardhm_torch.tiles.store import cluster_bytes, joined, state_of
+from lardhm_torch.tiles.splitting import join_states, state_of
+from lardhm_torch.tiles.store import cluster_bytes
 
 TOLERANCES = {torch.float32: 1e-4, F64: 1e-6}
 both = pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -52,7 +53,7 @@ def test_answers_at_borders_are_those_of_the_merged_map(
 ):
     tiles = tiled(random_map(1, dim, dtype), tmp_path, monkeypatch, block_clusters)
     assert len(tiles.manifest.tiles) > 10
-    assert tiles._parts.layout.block_tiles < 4
+    assert tiles._local.layout.block_tiles < 4
     assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 5_000))
 
 
@@ -68,7 +69,7 @@ def test_tiles_of_different_frames_answer_as_one(dtype, tmp_path, monkeypatch):
 
 
 @both
-def test_far_from_the_origin_parts_keep_their_digits(dtype, tmp_path, monkeypatch):
+def test_far_from_the_origin_local_keep_their_digits(dtype, tmp_path, monkeypatch):
     """A map at 175 km, where float32 in the map's frame would know no centimeters."""
     model = random_map(2, dtype=dtype)
     tiles = reframed(tiled(model, tmp_path, monkeypatch))
@@ -84,7 +85,7 @@ def test_in_float32_two_places_2_km_apart_are_both_answered_as_near_one_origin(
     """They have so few clusters that one block could hold both, but no one frame would do."""
     here, there = random_map(2), random_map(3)
     there.origin[0] += 286 * EDGE
-    model = joined([state_of(m) for m in (here, there)], here.settings, here.origin).float()
+    model = join_states([state_of(m) for m in (here, there)], here.settings, here.origin).float()
     tiles = reframed(tiled(model, tmp_path, monkeypatch, block_clusters=layout.BLOCK_CLUSTERS))
     points = border_points(tiles, 8000)[:4000]  # those near clusters
     truth, is_far = exact_map(tiles)(points), points[:, 0] > 1000
@@ -124,7 +125,7 @@ def test_answers_of_real_maps_at_borders_are_those_of_the_merged_map(
     monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 300)
     for dtype in (torch.float32, F64):
         tiles = TiledMap.split(model.to(dtype), tmp_path / str(dtype), 15.0)
-        assert tiles._parts.layout.block_tiles < 4
+        assert tiles._local.layout.block_tiles < 4
         assert_answers_alike(tiles, tiles.merge(), border_points(tiles, 100_000))
 
 
@@ -157,26 +158,26 @@ def test_a_part_answers_inside_its_bounds_like_the_whole(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_every_neighbor_that_speaks_is_in_a_needed_tile(seed, tmp_path, monkeypatch):
+def test_every_neighbor_that_contributes_is_in_a_needed_tile(seed, tmp_path, monkeypatch):
     tiles = tiled(random_map(seed), tmp_path, monkeypatch)
     plan, model = layout_of(tiles.manifest), tiles.merge()
     points = border_points(tiles, 100, seed)
     indices, values = model._nearest_features(model._to_map_frame(points))
-    speaks = (values * model.weights[indices]).abs() > 1e-9
+    contributes = (values * model.weights[indices]).abs() > 1e-9
     owners = tile_indices(model.centers, [0.0] * 3, EDGE)
-    for point, near, spoken in zip(points, indices, speaks, strict=True):
+    for point, near, contributing in zip(points, indices, contributes, strict=True):
         needed = {plan.indices[row] for row in needed_tiles(plan, point, point).tolist()}
-        assert {tuple(owners[row].tolist()) for row in near[spoken]} <= needed
+        assert {tuple(owners[row].tolist()) for row in near[contributing]} <= needed
 
 
-def test_one_cluster_of_wide_reach_does_not_call_for_the_whole_map(tmp_path, monkeypatch):
+def test_one_cluster_with_a_large_support_does_not_require_the_whole_map(tmp_path, monkeypatch):
     model = random_map(3, clusters=4000)
     with torch.no_grad():
         model.raw_scale_tril[0].diagonal().fill_(3.0)  # 20 m, in a map of 20 m
     tiles = tiled(model, tmp_path, monkeypatch, edge=6.0)
     point = torch.full((3,), 110.0, dtype=F64)
-    assert tiles._parts.layout.reach.max() > 100
-    assert len(needed_tiles(tiles._parts.layout, point, point)) < len(tiles.manifest.tiles) / 2
+    assert tiles._local.layout.radius.max() > 100
+    assert len(needed_tiles(tiles._local.layout, point, point)) < len(tiles.manifest.tiles) / 2
     torch.testing.assert_close(tiles.log_odds(point), tiles.merge().log_odds(point))
 
 
@@ -197,7 +198,7 @@ def test_points_may_have_any_leading_shape_and_order(tmp_path, monkeypatch):
     torch.testing.assert_close(tiles(grouped), tiles.merge()(grouped))
 
 
-def test_points_in_no_tile_hear_the_clusters_next_door(tmp_path, monkeypatch):
+def test_points_outside_all_tiles_are_answered_by_the_nearest_ones(tmp_path, monkeypatch):
     model = random_map(clusters=300)
     with torch.no_grad():
         model.weights.abs_()
@@ -332,7 +333,9 @@ def test_posteriors_learned_apart_are_none_of_the_whole(tmp_path, monkeypatch):
     first, second = (random_map().fit_uncertainty(points, labels) for labels in answers)
     assert not torch.equal(first.posterior_scales, second.posterior_scales)
     with pytest.raises(RuntimeError, match="variance needs the posterior"):
-        joined([state_of(first), state_of(second)], model.settings, model.origin).variance(points)
+        join_states([state_of(first), state_of(second)], model.settings, model.origin).variance(
+            points
+        )
 
 
 def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
@@ -344,7 +347,7 @@ def test_what_is_held_stays_below_the_memory_limit(tmp_path, monkeypatch):
     expected = model(points)
     for some in points.split(20):
         tiles(some)
-        cache = tiles._parts.cache
+        cache = tiles._local.cache
         held = sum(len(state["weights"]) for state, _ in cache._tiles.values())
         held += sum(len(part) for part, _ in cache._maps.values())
         assert held * cluster_bytes(3, F64) == cache.num_bytes
@@ -366,7 +369,7 @@ def test_a_limit_too_small_for_a_block_is_an_error(tmp_path, monkeypatch):
         ValueError, match=r"memory_limit must be \d+ bytes or more to hold the tiles"
     ):
         tiles(torch.full((1, 3), 105.0))
-    with pytest.raises(ValueError, match="to hold all clusters, which are asked for; got 1000"):
+    with pytest.raises(ValueError, match="to hold all clusters of the map; got 1000"):
         _ = tiles.centers
     with pytest.raises(ValueError, match="memory_limit must be > 0 bytes; got 0"):
         TiledMap.open(tmp_path / "tiles", memory_limit=0)

@@ -9,11 +9,11 @@ from room_tiles import CONFIG, EDGE, contents, room_folder, room_pieces
 
 from lardhm_torch import SamplingConfig, Scans, sample_rays
 from lardhm_torch.tiles import routing
-from lardhm_torch.tiles.cutting import Grid, grid_origin, route
+from lardhm_torch.tiles.indexing import grid_origin, samples_path, tile_indices
+from lardhm_torch.tiles.ledger import Counts, read_ledger
 from lardhm_torch.tiles.manifest import read_manifest
-from lardhm_torch.tiles.places import samples_path, tile_indices
+from lardhm_torch.tiles.records import Grid, read_records, route, unpack
 from lardhm_torch.tiles.routing import TilingConfig, add_scans, tile_scans
-from lardhm_torch.tiles.samples import Counts, read_ledger, read_records, unpack
 
 CPU = torch.device("cpu")
 
@@ -21,7 +21,7 @@ CPU = torch.device("cpu")
 def points_of(folder, index, limit=1 << 20):
     """World positions, labels and whether in the core of one tile."""
     manifest, ledger = read_manifest(folder), read_ledger(folder)
-    records = read_records(folder, index, ledger.tiles[index], manifest.dim, limit)
+    records = read_records(folder, index, sum(ledger.tiles[index]), manifest.dim, limit)
     tile = unpack(records, CPU, torch.float64)
     corner = torch.tensor(manifest.origin, dtype=torch.float64) + EDGE * torch.tensor(index)
     return tile._replace(points=tile.points + corner)
@@ -233,7 +233,7 @@ def test_cut_and_damaged_files_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"samples\.json must be the ledger of a tiled map, whole"):
         read_ledger(folder)
     (folder / "samples.json").unlink()
-    with pytest.raises(FileNotFoundError, match=r"has no samples\.json. `lardhm tile` makes it"):
+    with pytest.raises(FileNotFoundError, match=r"has no samples\.json. `lardhm tile` writes it"):
         read_ledger(folder)
 
 

@@ -10,9 +10,9 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.parameters import assign_state
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.entries import tile_record
+from lardhm_torch.tiles.indexing import tile_path
 from lardhm_torch.tiles.manifest import write_manifest
-from lardhm_torch.tiles.places import tile_path
-from lardhm_torch.tiles.store import joined, state_of
+from lardhm_torch.tiles.splitting import join_states, state_of
 
 F64 = torch.float64
 EDGE = 7.0  # [m] of 3-D tiles: 27 of a random map
@@ -50,7 +50,7 @@ def reframed(tiles):
     for index, tile in tiles.manifest.tiles.items():
         path = tile_path(tiles.folder, index)
         model = LardHilbertMap.load(path)
-        joined(
+        join_states(
             [state_of(model)], model.settings, model.origin + 3.0 + EDGE * torch.tensor(index)
         ).save(path)
         entries[index] = tile_record(LardHilbertMap.load(path), path, tile.num_points)
@@ -78,7 +78,7 @@ def exact_map(tiles):
         state_of(LardHilbertMap.load(tile_path(tiles.folder, i)).double())
         for i in tiles.manifest.tiles
     ]
-    return joined(states, tiles.settings, tiles.origin)
+    return join_states(states, tiles.settings, tiles.origin)
 
 
 def border_points(tiles, count, seed=0, within=0.5):

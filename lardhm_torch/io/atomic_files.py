@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writing: a file is complete under its name, or it is not there."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_PARTIAL = re.compile(r"\.[0-9a-f]{8}\..+")  # name of a file that is not yet whole
+_PARTIAL = re.compile(r"\.[0-9a-f]{8}\.(.+)", re.DOTALL)  # temporary file of the file in group 1
 
 
 @contextmanager
 def replaced_file(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[Path]:
-    """A new file beside path, which takes path's name at the end of the block, in one step.
+    """A temporary file that replaces ``path`` in one step when the block ends.
 
-    After a failure or a kill the old file is still there, whole. Who has it open keeps its
-    content. Through a link, what it points to is replaced and the link stays.
+    If the block fails or the process is killed, an existing file stays as it was. Processes that
+    have it open keep reading the old content. If path is a symbolic link, its target is replaced.
 
         with replaced_file("map.pt") as partial:
             torch.save(state, partial)
 
     Args:
-        path: of the file.
-        durable: False saves the milliseconds that it takes to have the bytes on the disk: after a
-            power failure (not after a kill) the file may then be empty or cut.
+        path: the file to write.
+        durable: call ``fsync`` before the file is renamed. False saves some milliseconds, but after
+            a power failure (not after a kill) the file may be empty or truncated.
 
     Yields:
-        A path of the same folder and extension, to an empty file.
+        Path of an empty temporary file in the same folder, with the same extension.
 
     Raises:
         FileNotFoundError: the folder of path does not exist.
@@ -41,7 +41,7 @@ def replaced_file(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
         )
     if target.is_dir():
         raise IsADirectoryError(f"path must be a file to write; {target} is a folder")
-    partial = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
+    partial = target.with_name(f".{secrets.token_hex(4)}.{target.name}")  # matches _PARTIAL
     os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # as the umask allows
     try:
         yield partial
@@ -53,8 +53,18 @@ def replaced_file(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
         partial.unlink(missing_ok=True)
 
 
-def remove_partials(folder: str | os.PathLike[str]) -> None:
-    """Remove what writers that were killed left in a folder. No one may be writing there."""
-    for path in Path(folder).iterdir():
-        if _PARTIAL.fullmatch(path.name) and path.is_file():
-            path.unlink()
+def remove_partials(path: str | os.PathLike[str]) -> None:
+    """Remove the temporary files that killed writers left behind.
+
+    No other process may be writing them at the same time.
+
+    Args:
+        path: a file, whose temporary files are removed; or a folder: those of all its files (not
+            of its subfolders).
+    """
+    target = Path(os.path.realpath(path))
+    is_folder = target.is_dir()
+    for file in (target if is_folder else target.parent).iterdir():
+        found = _PARTIAL.fullmatch(file.name)
+        if found and (is_folder or found[1] == target.name) and file.is_file():
+            file.unlink()

@@ -1,67 +1,71 @@
-"""Map files: a state dict written atomically and read without running any code from the file."""
+"""Map files: the state dict of a map on disk, written atomically and verified when it is read.
+
+The extension of the path chooses the format (docs/map_format.md describes the content):
+
+- ``.safetensors``: tensors behind a JSON header, with a CRC-32 of everything in its metadata;
+- any other: torch's own format, a zip file with a CRC-32 for each entry, which is verified here
+  because `torch.load` does not.
+
+No code in a file is ever run.
+"""
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import warnings
+import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
+from safetensors import SafetensorError
+from safetensors import torch as safetensors_torch
 from torch import Tensor
 
 from lardhm_torch.io.atomic_files import replaced_file
 
 FORMAT_VERSION = 1
-STREAM_KEY = "_stream"  # beside a map's tensors: how much of a stream of scans is in it
+STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
+SAFETENSORS = ".safetensors"
+MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it
 
 
 def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
-    """Write a state dict; after a failure or a kill the old file is still there, whole.
+    """Write a state dict atomically: if writing fails, an existing file stays as it was.
 
-    A path that ends in ``.safetensors`` gets that format, whose metadata holds all that is no
-    tensor, as JSON under its own key. Any other path gets torch's.
+    Args:
+        state: tensors and plain Python values by name.
+        path: a path that ends in ``.safetensors`` gets that format, in which every value that is
+            not a tensor is JSON in the metadata; any other path gets torch's format.
 
     Raises:
         FileNotFoundError: the folder of path does not exist.
-        ImportError: safetensors is asked for and not installed.
     """
     with replaced_file(path) as partial:
         if _is_safetensors(path):
             _write_safetensors(state, partial)
         else:
-            with open(partial, "wb") as file:
-                torch.save({name: _without_reserve(value) for name, value in state.items()}, file)
-
-
-def _without_reserve(value: Any) -> Any:
-    """A tensor that is a view of more memory (a map that grows) as a copy: torch writes all of it."""
-    if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
-        return value.clone()
-    return value
+            _write_torch(state, partial)
 
 
 def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a state dict of tensors and plain values; nothing in the file is executed.
+    """Read a state dict of tensors and plain values and verify its checksums.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not a map file, is cut short, or holds more than tensors and plain
-            values.
-        ImportError: the file ends in .safetensors, which is not installed.
+        ValueError: the file is not a map file, is truncated or damaged, or holds anything but
+            tensors and plain values.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"map file {path} does not exist")
-    read = _read_safetensors if _is_safetensors(path) else _read_torch
     try:
-        state = read(path)
-    except ImportError:
-        raise
+        state = _read_safetensors(path) if _is_safetensors(path) else _read_torch(path)
     except Exception as error:
-        # Broken bytes surface from pickle, zipfile, torch and safetensors under a dozen types.
+        # Damaged bytes raise a dozen exception types from pickle, zipfile, torch and safetensors.
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ValueError(f"{path} must be a map file, whole and safe to load; {reason}") from error
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
@@ -85,7 +89,11 @@ def map_settings(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_settings(extra: Any) -> dict[str, Any]:
-    """The settings in a map's extra state, without the format version, or a ValueError."""
+    """The settings in the extra state of a map, without the format version.
+
+    Raises:
+        ValueError: there are none, or the format version is not supported.
+    """
     if not isinstance(extra, dict) or not isinstance(extra.get("format_version"), int):
         raise ValueError(
             "_extra_state must hold the map's format version and settings; it does not"
@@ -100,35 +108,89 @@ def check_settings(extra: Any) -> dict[str, Any]:
     return settings
 
 
-def _read_torch(path: Path) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of pickle protocols; the error says enough
-        return torch.load(path, map_location="cpu", weights_only=True)
+def decode_safetensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata in the bytes of a ``.safetensors`` file; the checksum is not verified.
+
+    Raises:
+        ValueError: the bytes are not such a file.
+    """
+    try:
+        tensors = safetensors_torch.load(content)
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
+    header_end = 8 + int.from_bytes(content[:8], "little")
+    return tensors, json.loads(content[8:header_end]).get("__metadata__", {})
 
 
 def _is_safetensors(path: str | os.PathLike[str]) -> bool:
-    return Path(path).suffix.lower() == ".safetensors"
+    return Path(path).suffix.lower() == SAFETENSORS
 
 
-def _write_safetensors(state: dict[str, Any], path: Path) -> None:
-    torch_files = _import_safetensors("torch")
-    tensors = {k: v.detach().contiguous() for k, v in state.items() if isinstance(v, Tensor)}
-    other = {k: json.dumps(v) for k, v in state.items() if not isinstance(v, Tensor)}
-    torch_files.save_file(tensors, path, metadata={"format": "pt", **other})
+def _write_torch(state: Mapping[str, Any], path: Path) -> None:
+    compact = {name: _without_reserve(value) for name, value in state.items()}
+    with_checksums = torch.serialization.get_crc32_options()
+    torch.serialization.set_crc32_options(True)  # the default; verified by `_read_torch`
+    try:
+        with open(path, "wb") as file:
+            torch.save(compact, file)
+    finally:
+        torch.serialization.set_crc32_options(with_checksums)
+
+
+def _without_reserve(value: Any) -> Any:
+    """A copy of a tensor that is a view of a larger storage, which torch would write as a whole."""
+    if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
+        return value.clone()
+    return value
+
+
+def _read_torch(path: Path) -> Any:
+    with open(path, "rb") as file:
+        _verify_zip(file)
+        file.seek(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about pickle protocols; the error is enough
+            return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _verify_zip(file: BinaryIO) -> None:
+    """A ValueError where a checksum differs, or torch would take an entry for an empty folder."""
+    with zipfile.ZipFile(file) as archive:
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"the checksum of its entry {damaged} differs: the file is damaged")
+        for entry in archive.infolist():
+            if entry.external_attr & MSDOS_DIRECTORY:
+                raise ValueError(f"its entry {entry.filename} must be a file, not a folder")
+
+
+def _write_safetensors(state: Mapping[str, Any], path: Path) -> None:
+    tensors = {
+        name: value.detach().cpu().contiguous()
+        for name, value in state.items()
+        if isinstance(value, Tensor)
+    }
+    other = {name: json.dumps(value) for name, value in state.items() if name not in tensors}
+    metadata = {"format": "pt", "checksum": _checksum(tensors, other), **other}
+    # `save_file` would replace the file by one that only its owner can read.
+    path.write_bytes(safetensors_torch.save(tensors, metadata))
 
 
 def _read_safetensors(path: Path) -> dict[str, Any]:
-    with _import_safetensors().safe_open(path, framework="pt") as file:
-        # Copies: the file is mapped into memory, and may be replaced.
-        state = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-        metadata = file.metadata() or {}
-    return {**state, **{k: json.loads(v) for k, v in metadata.items() if k != "format"}}
+    tensors, metadata = decode_safetensors(path.read_bytes())
+    other = {k: text for k, text in metadata.items() if k not in ("format", "checksum")}
+    if "checksum" not in metadata:
+        raise ValueError("its metadata must hold a checksum; write it with LardHilbertMap.save")
+    if metadata["checksum"] != _checksum(tensors, other):
+        raise ValueError("the checksum of its content differs: the file is damaged")
+    return {**tensors, **{name: json.loads(text) for name, text in other.items()}}
 
 
-def _import_safetensors(part: str = "") -> Any:
-    try:
-        return importlib.import_module(f"safetensors.{part}".rstrip("."))
-    except ImportError as error:
-        raise ImportError(
-            'map files in .safetensors need safetensors: pip install "lardhm_torch[io]"'
-        ) from error
+def _checksum(tensors: Mapping[str, Tensor], other: Mapping[str, str]) -> str:
+    """CRC-32, hexadecimal, of names, types, shapes, other values and the bytes of all tensors."""
+    names = sorted(tensors)
+    described = [[name, str(tensors[name].dtype), list(tensors[name].shape)] for name in names]
+    value = zlib.crc32(json.dumps([described, sorted(other.items())]).encode())
+    for name in names:
+        value = zlib.crc32(tensors[name].reshape(-1).view(torch.uint8).numpy().data, value)
+    return f"{value:08x}"

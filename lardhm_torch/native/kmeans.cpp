@@ -139,7 +139,7 @@ Tensor kmeans(const Tensor& given_points, const Tensor& given_start, const Tenso
   return centers;
 }
 
-// Places along a Z curve of 2^10 cells an axis, as in `clustering.z_order`; ties keep their order.
+// Places along a Z curve of 2^10 cells an axis, as in `points.morton_order`; ties keep their order.
 Tensor z_order(const Tensor& given_points) {
   const Tensor points = tidy(given_points);
   const int64_t n = points.size(0);

@@ -1,1 +1,1 @@
-"""Maps larger than memory: a folder of tiles, each an ordinary map file, and one manifest."""
+"""Maps too large for memory: a folder of tiles, each an ordinary map file, and a manifest."""

@@ -1,13 +1,14 @@
-"""Clusters of a tile on disk, between the two phases of a fit: written by one rank, read by others.
+"""Files that hold the clusters of a tile between the two phases of a fit.
 
-Two int64, the number of points that the clusters were made of and the number M of clusters, then M
-rows of float32 or float64: 1 occupied or 0 free, count, mean, scatter. A tile reads the clusters of
-up to 26 neighbors, so reading must take microseconds.
+One process writes the file of a tile and several read it: a tile needs the clusters of up to 26
+neighbors, so that reading must take microseconds. Three int64: the number of points that were
+clustered, the number M of clusters, and the CRC-32 of what follows: M rows of float32 or float64,
+each 1 (occupied) or 0 (free), count, mean and scatter.
 """
 
 from __future__ import annotations
 
-import os
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,21 +20,21 @@ from torch import Tensor
 
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.learning.clustering import Clusters
-from lardhm_torch.tiles.places import Index, tile_name
 from lardhm_torch.tiles.training import TileClusters
 
-_HEAD_BYTES = 16
+_HEAD_BYTES = 24
 Corner = NDArray[np.float64]
 Box = tuple[Corner, Corner]
 
 
-def clusters_path(folder: str | os.PathLike[str], index: Index) -> Path:
-    """The clusters of a tile's core."""
-    return Path(folder) / "clusters" / tile_name(index)
-
-
 def save_clusters(path: Path, found: TileClusters, num_points: int) -> None:
-    """Write the clusters of a tile's ``num_points`` points, in one step."""
+    """Write the clusters of a tile atomically.
+
+    Args:
+        path: the file.
+        found: the clusters.
+        num_points: number of points that were clustered.
+    """
     clusters = found.clusters
     columns = [
         found.is_occupied[:, None].to(clusters.means),
@@ -41,18 +42,18 @@ def save_clusters(path: Path, found: TileClusters, num_points: int) -> None:
         clusters.means,
         clusters.scatters.flatten(1),
     ]
-    table = torch.cat(columns, dim=1).cpu().numpy()
-    # Not durable: what a power failure cuts is seen by its size, and made anew.
-    with replaced_file(path, durable=False) as partial, open(partial, "wb") as file:
-        file.write(np.array([num_points, len(table)], "<i8").tobytes())
-        file.write(table.tobytes())
+    table = torch.cat(columns, dim=1).cpu().numpy().tobytes()
+    head = np.array([num_points, len(found.is_occupied), zlib.crc32(table)], "<i8")
+    # Without fsync: a file that a power failure truncates is recognized and written again.
+    with replaced_file(path, durable=False) as partial:
+        partial.write_bytes(head.tobytes() + table)
 
 
 def load_clusters(path: Path, like: Tensor) -> TileClusters:
-    """What `save_clusters` wrote, on the device and of the dtype of a tensor (..., D).
+    """Read the clusters of a tile, with the device and dtype of a tensor (..., D).
 
     Raises:
-        ValueError: the file is damaged.
+        ValueError: the file is missing or damaged.
     """
     return _as_clusters(_table(path, like), like)
 
@@ -60,12 +61,15 @@ def load_clusters(path: Path, like: Tensor) -> TileClusters:
 def load_clusters_near(
     sources: Iterable[tuple[Path, Corner]], box: Box, like: Tensor
 ) -> TileClusters:
-    """The clusters of several files that lie in a box, as one.
+    """Read the clusters of several tiles whose means lie in a box.
 
     Args:
-        sources: files, and where the origin of each file's frame lies (D,) [m].
-        box: lower and upper corner (D,) [m].
-        like: gives device, dtype and dimension.
+        sources: files, and the offset (D,) [m] that moves the means of each to a common frame.
+        box: lower and upper corner (D,) in that frame [m].
+        like: tensor (..., D) that gives device and dtype.
+
+    Raises:
+        ValueError: a file is missing or damaged.
     """
     dim = like.shape[-1]
     parts = [np.empty((0, 2 + dim + dim * dim), _kind(like))]
@@ -78,6 +82,12 @@ def load_clusters_near(
         table[:, 2 : 2 + dim] += shift
         parts.append(table)
     return _as_clusters(np.concatenate(parts), like)
+
+
+def clustered_points(path: Path, like: Tensor) -> int | None:
+    """Number of points whose clusters a file holds; None if it is missing or damaged."""
+    found = _read(path, like)
+    return None if found is None else found[0]
 
 
 def _as_clusters(table: NDArray[Any], like: Tensor) -> TileClusters:
@@ -93,7 +103,7 @@ def _as_clusters(table: NDArray[Any], like: Tensor) -> TileClusters:
 def _table(path: Path, like: Tensor) -> NDArray[Any]:
     found = _read(path, like)
     if found is None:
-        raise ValueError(f"{path} must hold clusters, whole; it does not. Run the fit again")
+        raise ValueError(f"{path} must hold the clusters of a tile, whole: fit the tiles again")
     return found[1]
 
 
@@ -101,22 +111,18 @@ def _kind(like: Tensor) -> str:
     return "<f8" if like.dtype == torch.float64 else "<f4"
 
 
-def clustered_points(path: Path, like: Tensor) -> int | None:
-    """Of how many points the clusters in a file were made; None if there is no such file, whole."""
-    found = _read(path, like)
-    return None if found is None else found[0]
-
-
 def _read(path: Path, like: Tensor) -> tuple[int, NDArray[Any]] | None:
+    """Number of points and (M, ...) rows; None if the file is missing or damaged."""
     try:
         content = np.fromfile(path, np.uint8)
     except OSError:
         return None
     if len(content) < _HEAD_BYTES:
         return None
-    num_points, rows = content[:_HEAD_BYTES].view("<i8").tolist()
+    num_points, rows, checksum = content[:_HEAD_BYTES].view("<i8").tolist()
     dim = like.shape[-1]
     columns = 2 + dim + dim * dim
-    if len(content) != _HEAD_BYTES + rows * columns * like.element_size():
+    body = content[_HEAD_BYTES:]
+    if len(body) != rows * columns * like.element_size() or zlib.crc32(body.data) != checksum:
         return None
-    return num_points, content[_HEAD_BYTES:].view(_kind(like)).reshape(rows, columns)
+    return num_points, body.view(_kind(like)).reshape(rows, columns)

@@ -1,19 +1,18 @@
-"""All tiles of a folder, by one process or many: first the clusters of all, then the weights.
+"""Fitting the tiles of a folder, by one process or several: first clusters, then weights.
 
-Between the two phases everyone waits, because the weights of a tile are trained among the clusters
-of its neighbors. Nothing else is shared, and all random numbers follow from the seed and the tile's
-index: the result is the same for any number of processes and any order. Finished tiles wait in
-``fitted/`` and are taken over together at the end, so that a folder that was whole stays whole if
-the job is killed; called again, it goes on.
+All processes wait between the two phases, because the weights of a tile are trained together with
+the clusters of its neighbors. Random seeds are derived from the folder's seed and the index of the
+tile, so that the result does not depend on the number of processes or on the order of the tiles.
+Finished tiles are kept in ``fitted/`` and moved to ``tiles/`` together at the end: if the job is
+killed, the previous map stays valid, and the next call continues.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +22,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.io.atomic_files import remove_partials, replaced_file
+from lardhm_torch.io.atomic_files import remove_partials
+from lardhm_torch.io.map_files import SAFETENSORS
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.parameters import write_state
 from lardhm_torch.tiles.cluster_files import (
     clustered_points,
-    clusters_path,
     load_clusters,
     load_clusters_near,
     save_clusters,
@@ -41,10 +40,24 @@ from lardhm_torch.tiles.entries import (
     tile_record,
     tile_to_json,
 )
-from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
-from lardhm_torch.tiles.places import Index, tile_name, tile_path, touching_tiles
+from lardhm_torch.tiles.indexing import (
+    Folder,
+    Index,
+    clusters_path,
+    tile_name,
+    tile_path,
+    touching_tiles,
+)
+from lardhm_torch.tiles.ledger import Counts, read_ledger
+from lardhm_torch.tiles.manifest import (
+    Manifest,
+    read_manifest,
+    read_page,
+    write_manifest,
+    write_page,
+)
 from lardhm_torch.tiles.ranks import Ranks, join_ranks, one_thread
-from lardhm_torch.tiles.samples import Counts, TilePoints, read_ledger, read_records, unpack
+from lardhm_torch.tiles.records import TilePoints, read_records, unpack
 from lardhm_torch.tiles.training import (
     TileClusters,
     TrainingTask,
@@ -53,64 +66,65 @@ from lardhm_torch.tiles.training import (
     train_tile,
 )
 
-MOST_POINTS = 1 << 23  # of a tile that are held at a time; a tile of more is fitted to so many
-CLUSTER_SHARE = (
-    0.45  # of the time that the clusters of a tile take, for the estimate of what is left
-)
+MOST_POINTS = 1 << 23  # a tile with more is fitted to so many of its points
+CLUSTERING_RATIO = 0.45  # of the time of a fit, for the progress bar
 
 
 @torch.no_grad()
-def fit_tiles(folder: str | os.PathLike[str], *, progress: bool = False) -> Manifest:
-    """Fit the tiles of a folder that are not fitted, are damaged, or whose points have changed since.
+def fit_tiles(folder: Folder, *, progress: bool = False) -> Manifest:
+    """Fit all tiles that are new or damaged, or whose training points have changed.
 
-    One thread, in this process; under `torchrun` the processes share the tiles. A killed job is
-    continued by calling it again: at most the tiles in work are lost.
+    Uses one thread of this process; under `torchrun`, the processes share the tiles. After a kill,
+    call it again to continue: only the tiles that were being fitted are lost.
 
     Args:
-        folder: that `tile_scans` completed, on a disk that all processes see.
-        progress: show a bar with an estimate of the time left on a terminal.
+        folder: a folder that `tile_scans` completed, on a disk that all processes can access.
+        progress: show a progress bar on a terminal.
 
     Returns:
-        The manifest of the folder, now with all tiles.
+        The manifest of the folder, which now lists all tiles.
 
     Raises:
-        FileNotFoundError, ValueError: the folder is not a tiled map, is not complete, or a file in
-            it is damaged.
+        FileNotFoundError, ValueError: the folder is not a complete tiled map, or a file in it is
+            damaged.
     """
     with join_ranks() as ranks, one_thread():
         job = _Job(Path(folder), ranks)
-        wanted = [tuple(index) for index in ranks.agree("wanted", job.wanted)]
-        unclustered = [
-            tuple(i) for i in ranks.agree("unclustered", lambda: job.unclustered(wanted))
-        ]
-        unfitted = [tuple(index) for index in ranks.agree("left", lambda: job.unfitted(wanted))]
+        wanted = _agreed(ranks, "wanted", job.wanted)
+        unclustered = _agreed(ranks, "unclustered", lambda: job.unclustered(wanted))
+        unfitted = _agreed(ranks, "unfitted", lambda: job.unfitted(wanted))
         phases = (
-            ("clusters", unclustered, job.cluster, CLUSTER_SHARE),
-            ("weights", unfitted, job.train, 1 - CLUSTER_SHARE),
+            ("clusters", unclustered, job.cluster, CLUSTERING_RATIO),
+            ("weights", unfitted, job.train, 1 - CLUSTERING_RATIO),
         )
-        total = sum(share * job.num_points(tiles) for _, tiles, _, share in phases)
-        hidden = None if progress and ranks.rank == 0 else True  # None: on a terminal alone
+        total = sum(ratio * job.num_points(tiles) for _, tiles, _, ratio in phases)
+        hidden = None if progress and ranks.rank == 0 else True  # None: shown on a terminal only
         with tqdm(total=round(total), unit="point", unit_scale=True, disable=hidden) as bar:
-            for name, tiles, do, share in phases:
+            for name, tiles, do, ratio in phases:
                 for index in ranks.take(name, tiles):
                     do(index)
-                    done = ranks.count("points", round(share * job.num_points([index])))
+                    done = ranks.count("points", round(ratio * job.num_points([index])))
                     bar.update(done - bar.n)
                 ranks.wait()
         if ranks.rank == 0:
-            job.take_over(wanted)
+            job.publish(wanted)
         ranks.wait()
     return read_manifest(folder)
 
 
+def _agreed(ranks: Ranks, name: str, decide: Callable[[], list[Index]]) -> list[Index]:
+    """The list of tiles that rank 0 makes, on all ranks."""
+    return [tuple(index) for index in ranks.agree(name, decide)]
+
+
 class _Job:
-    """The tiles of one folder, each step on its own."""
+    """The steps of fitting the tiles of a folder."""
 
     def __init__(self, folder: Path, ranks: Ranks) -> None:
         self.folder, self.device = folder, ranks.device
         self.manifest, self.ledger = read_manifest(folder), read_ledger(folder)
         if not self.ledger.complete:
-            raise ValueError(f"{folder} must be complete; run `lardhm tile` to its end")
+            raise ValueError(f"{folder} must be complete; let `lardhm tile` finish")
         self.config = FitConfig(**self.manifest.fitting)
         self.first_corner = np.array(self.manifest.origin)
         self.budget = make_budget(self.ledger.tiles, self.config)
@@ -120,10 +134,10 @@ class _Job:
         for name in ("clusters", "fitted", "tiles"):
             (folder / name).mkdir(exist_ok=True)
 
-    # --- what is to do; decided by rank 0, largest first so that the ranks end together ---
+    # --- the work; largest tiles first, so that all ranks end at about the same time ---
 
     def wanted(self) -> list[Index]:
-        """Tiles that the manifest does not know as their points are now, or whose file is damaged."""
+        """Tiles without a valid map of their current training points."""
         known = self.manifest.tiles
         return self._largest_first(
             index
@@ -134,7 +148,7 @@ class _Job:
         )
 
     def unclustered(self, wanted: list[Index]) -> list[Index]:
-        """Of the wanted tiles and their neighbors, those without clusters of all their points."""
+        """Those of the wanted tiles and their neighbors that are not clustered yet."""
         needed = {near for index in wanted for near in (index, *self._neighbors(index))}
         return self._largest_first(
             index
@@ -144,11 +158,11 @@ class _Job:
         )
 
     def unfitted(self, wanted: list[Index]) -> list[Index]:
-        """Of the wanted tiles, those that do not wait in ``fitted/``."""
+        """Those of the wanted tiles that are not in ``fitted/`` yet."""
         return [index for index in wanted if self._fitted(index) is None]
 
     def num_points(self, tiles: list[Index]) -> int:
-        """Of the cores of some tiles."""
+        """Number of training points inside some tiles."""
         return sum(self.ledger.tiles[index].core for index in tiles)
 
     def _largest_first(self, tiles: Iterable[Index]) -> list[Index]:
@@ -157,7 +171,7 @@ class _Job:
     # --- one tile ---
 
     def cluster(self, index: Index) -> None:
-        """Phase one: the clusters of a tile's core to their file."""
+        """Phase one: cluster the points inside a tile."""
         found = cluster_tile(
             self._points(index),
             self.budget.num_clusters(self.ledger.tiles[index]),
@@ -166,7 +180,7 @@ class _Job:
         save_clusters(clusters_path(self.folder, index), found, self.ledger.tiles[index].core)
 
     def train(self, index: Index) -> None:
-        """Phase two: a tile's map, and its entry of the manifest, to ``fitted/``."""
+        """Phase two: train a tile; its map and its entry for the manifest go to ``fitted/``."""
         own = load_clusters(clusters_path(self.folder, index), self.empty.centers)
         kernel, tile = self.empty.kernel, self._points(index)
         task = TrainingTask(kernel, self.config, self._rng(index, "weights"))
@@ -178,21 +192,21 @@ class _Job:
         write_state(
             model, MapState(weights, clusters.means, raw, own.is_occupied, *moments), origin
         )
-        path = self._fitted_path(index, ".pt")
+        path = self._fitted_path(index, SAFETENSORS)
         model.cpu().save(path)
         record = tile_record(model, path, self.ledger.tiles[index].core)
-        with replaced_file(self._fitted_path(index, ".json"), durable=False) as partial:
-            partial.write_text(json.dumps({"chunks": self.ledger.chunks, **tile_to_json(record)}))
+        body = {"chunks": self.ledger.chunks, "tile": tile_to_json(record)}
+        write_page(self._fitted_path(index, ".json"), body, durable=False)
 
     def _points(self, index: Index) -> TilePoints:
-        """A tile's points in the frame of its map."""
-        counts = self.ledger.tiles[index]
-        records = read_records(self.folder, index, counts, self.manifest.dim, MOST_POINTS)
+        """The training points of a tile in the frame of its map."""
+        total = sum(self.ledger.tiles[index])
+        records = read_records(self.folder, index, total, self.manifest.dim, MOST_POINTS)
         shift = self._corner(index) - self._origin(index)
         return unpack(records, self.device, self.empty.centers.dtype, shift)
 
     def _around(self, index: Index) -> TileClusters:
-        """The neighbors' clusters within two halos, in the frame of a tile."""
+        """Clusters of the neighbors within two halos of a tile, in the frame of its map."""
         origin, margin = self._origin(index), 2 * self.manifest.halo
         lower = self._corner(index) - origin - margin
         box = (lower, lower + self.manifest.edge + 2 * margin)
@@ -203,7 +217,7 @@ class _Job:
         return load_clusters_near(sources, box, self.empty.centers)
 
     def _neighbors(self, index: Index) -> Iterator[Index]:
-        """The tiles that touch one, in order."""
+        """Tiles with points that touch a tile, in order."""
         for near in touching_tiles(index):
             if near != index and self.ledger.tiles.get(near, Counts()).core:
                 yield near
@@ -213,7 +227,7 @@ class _Job:
         return self.first_corner + self.manifest.edge * np.array(index)
 
     def _origin(self, index: Index) -> NDArray[np.float64]:
-        """(D,) origin of a tile's map: whole meters, as in `LardHilbertMap.fit`."""
+        """(D,) origin of a tile's map, in whole meters as in `LardHilbertMap.fit`."""
         return self._corner(index).round()
 
     def _rng(self, index: Index, phase: str) -> torch.Generator:
@@ -227,17 +241,18 @@ class _Job:
         return self.folder / "fitted" / f"{tile_name(index)}{suffix}"
 
     def _fitted(self, index: Index) -> Tile | None:
-        """The entry of a tile that was fitted to the points there are now."""
+        """Entry of a tile that is fitted to its current points; None if it is not, or is damaged."""
         path = self._fitted_path(index, ".json")
         if not path.is_file():
             return None
-        fields = json.loads(path.read_text())
-        if fields.pop("chunks") != self.ledger.chunks:
+        try:
+            body = read_page(path)
+        except ValueError:
             return None
-        return tile_from_json(fields)
+        return tile_from_json(body["tile"]) if body["chunks"] == self.ledger.chunks else None
 
-    def take_over(self, wanted: list[Index]) -> None:
-        """Fitted tiles into the map; if killed within, the next call ends it."""
+    def publish(self, wanted: list[Index]) -> None:
+        """Move fitted tiles into the map. If it is interrupted, the next call finishes it."""
         found = {}
         for index in wanted:
             tile = self._fitted(index)
@@ -245,7 +260,7 @@ class _Job:
                 raise AssertionError(f"tile {tile_name(index)} was not fitted")
             found[index] = tile
         for index in wanted:
-            path = self._fitted_path(index, ".pt")
+            path = self._fitted_path(index, SAFETENSORS)
             if path.is_file():
                 os.replace(path, tile_path(self.folder, index))
         write_manifest(self.folder, replace(self.manifest, tiles={**self.manifest.tiles, **found}))

@@ -1,45 +1,49 @@
-"""Two tiled folders to one: of two robots, or of two machines that routed half the scans each."""
+"""Joining two tiled folders, of two robots or of two machines that each tiled half of the scans."""
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from lardhm_torch.tiles.cluster_files import clusters_path
 from lardhm_torch.tiles.entries import Tile
+from lardhm_torch.tiles.indexing import (
+    Folder,
+    Index,
+    clusters_path,
+    samples_path,
+    tile_path,
+    touching_tiles,
+)
+from lardhm_torch.tiles.ledger import Counts, Ledger, read_ledger, write_ledger
 from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
-from lardhm_torch.tiles.places import Index, samples_path, tile_path, touching_tiles
-from lardhm_torch.tiles.samples import Counts, Ledger, read_ledger, record_type, write_ledger
-
-PathLike = str | os.PathLike[str]
+from lardhm_torch.tiles.records import record_type
 
 
-def join_folders(first: PathLike, second: PathLike, target: PathLike) -> Manifest:
-    """Training points of both in a new folder, with those fitted tiles that are still true.
+def join_folders(first: Folder, second: Folder, target: Folder) -> Manifest:
+    """Copy the training points of two folders, and the fitted tiles that stay valid, to a new one.
 
-    A tile that has no points of the other folder in or next to it stays as it is fitted; `fit_tiles`
-    fits the others. Both folders stay as they are.
+    A fitted tile stays valid if neither it nor a tile that touches it contains points of the other
+    folder; `fit_tiles` fits the others. Both folders are left unchanged.
 
     Args:
         first: gives seed and settings.
-        second: of the same world frame, edge, halo, kernel and training.
-        target: is made; must be new or empty.
+        second: must have the same world frame, edge, halo, kernel, sampling and fitting.
+        target: is created; must be new or empty.
 
     Returns:
         The manifest of the new folder.
 
     Raises:
         FileNotFoundError: a folder holds no tiled map, or no training points.
-        ValueError: they differ in how they are made, or target is not empty.
+        ValueError: the folders are incomplete or differ in their settings, or target is not empty.
     """
     manifests = [read_manifest(folder) for folder in (first, second)]
     ledgers = [read_ledger(folder) for folder in (first, second)]
     for folder, ledger in zip((first, second), ledgers, strict=True):
         if not ledger.complete:
-            raise ValueError(f"{folder} must be complete; run `lardhm tile` to its end")
+            raise ValueError(f"{folder} must be complete; let `lardhm tile` finish")
     shift = _index_shift(*manifests)
     goal = Path(target)
     goal.mkdir(parents=True, exist_ok=True)
@@ -68,7 +72,7 @@ def join_folders(first: PathLike, second: PathLike, target: PathLike) -> Manifes
 
 
 def _index_shift(first: Manifest, second: Manifest) -> Index:
-    """What is added to an index of the second folder to get that of the first."""
+    """What must be added to an index of the second folder to get that of the first."""
     for name in ("edge", "halo", "settings", "dtype", "sampling", "fitting"):
         ours, theirs = getattr(first, name), getattr(second, name)
         if ours != theirs:
@@ -76,7 +80,7 @@ def _index_shift(first: Manifest, second: Manifest) -> Index:
     steps = [(b - a) / first.edge for a, b in zip(first.origin, second.origin, strict=True)]
     if any(abs(step - round(step)) > 1e-6 for step in steps):
         raise ValueError(
-            "both folders must have borders of tiles in the same places; "
+            "both folders must have tile borders at the same positions; "
             f"got the origins {first.origin} and {second.origin} with an edge of {first.edge} m"
         )
     return tuple(round(step) for step in steps)
@@ -91,19 +95,22 @@ def _total(first: Mapping[Index, Counts], second: Mapping[Index, Counts]) -> dic
 
 
 class _Source:
-    """One of the two folders, with indices as they are in the new one."""
+    """One of the two folders; its indices are those of the new folder."""
 
     def __init__(self, folder: Path, manifest: Manifest, ledger: Ledger, shift: Index) -> None:
         self.folder, self.manifest, self.shift = folder, manifest, shift
-        self.counts = {self._there(index): counts for index, counts in ledger.tiles.items()}
+        self.counts = {
+            tuple(i + s for i, s in zip(index, shift, strict=True)): counts
+            for index, counts in ledger.tiles.items()
+        }
         self.cores = {index for index, counts in self.counts.items() if counts.core}
 
     def append_samples(self, goal: Path) -> None:
-        """Records that count, behind those that are there."""
+        """Append all records that count to the files of the new folder."""
         size = record_type(self.manifest.dim).itemsize
         for index, counts in self.counts.items():
             with (
-                open(samples_path(self.folder, self._here(index)), "rb") as ours,
+                open(samples_path(self.folder, self._index_here(index)), "rb") as ours,
                 open(samples_path(goal, index), "ab") as file,
             ):
                 left = size * sum(counts)
@@ -111,13 +118,21 @@ class _Source:
                     file.write(content)
                     left -= len(content)
             if left:
-                raise ValueError(f"{ours.name} is {left} bytes too short: tile the scans anew")
+                raise ValueError(f"{ours.name} is {left} bytes too short: tile the scans again")
 
     def copy_fitted(self, goal: Path, others: set[Index]) -> dict[Index, Tile]:
-        """Tiles far from the points of the other folder; their entries of the manifest."""
+        """Copy clusters and tiles that points of the other folder do not change.
+
+        Args:
+            goal: the new folder.
+            others: tiles that contain points of the other folder.
+
+        Returns:
+            Entries of the copied tiles for the manifest.
+        """
         entries = {}
         for index in sorted(self.cores):
-            ours = self._here(index)
+            ours = self._index_here(index)
             if index not in others and clusters_path(self.folder, ours).is_file():
                 shutil.copyfile(clusters_path(self.folder, ours), clusters_path(goal, index))
             entry = self.manifest.tiles.get(ours)
@@ -130,8 +145,5 @@ class _Source:
                 entries[index] = entry
         return entries
 
-    def _here(self, index: Index) -> Index:
+    def _index_here(self, index: Index) -> Index:
         return tuple(i - s for i, s in zip(index, self.shift, strict=True))
-
-    def _there(self, index: Index) -> Index:
-        return tuple(i + s for i, s in zip(index, self.shift, strict=True))

@@ -1,14 +1,13 @@
-"""The manifest of a tiled map: where its tiles are, what is in them, and how to tell damage.
+"""The manifest of a tiled map: settings of the map, and an entry for each tile.
 
-A folder holds ``manifest.json``, ``samples/<name>.*`` (training points routed to the tiles) and
-``tiles/<name>.pt`` (one ordinary map file a tile); `places` says what the names mean.
+It is a JSON file with a format version and a checksum, as the ledger of training points is, and can
+be read without opening a tile.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,9 +23,9 @@ from lardhm_torch.tiles.entries import (
     tile_from_json,
     tile_to_json,
 )
-from lardhm_torch.tiles.places import Index, tile_index, tile_name
+from lardhm_torch.tiles.indexing import Folder, Index, tile_index, tile_name
 
-FORMAT_VERSION = 2  # 1 knew nothing of how thick clusters are
+FORMAT_VERSION = 3  # of the folder; 3: tiles are stored as safetensors
 MANIFEST_NAME = "manifest.json"
 DTYPES = ("float32", "float64")
 SETTINGS = ("dim", "num_neighbors", "covariance_scale", "min_lengthscale")
@@ -34,18 +33,21 @@ SETTINGS = ("dim", "num_neighbors", "covariance_scale", "min_lengthscale")
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """A tiled map on one page.
+    """Description of a tiled map.
 
     Args:
-        edge: of a tile [m].
-        halo: how far around a tile its neighbors took part in its training [m].
-        origin: (D,) world position of the corner where tile (0, 0, 0) begins [m].
-        settings: the arguments that make an empty map like those of the tiles.
-        dtype: of the tiles' tensors, "float32" or "float64".
-        sampling: how the routed points were sampled, plain values.
-        fitting: how tiles are fitted, plain values.
-        seed: of sampling, clustering and training.
-        tiles: the fitted tiles by index; one that no data fell into has no entry.
+        edge: edge length of a tile [m].
+        halo: distance around a tile within which points of its neighbors were used to train it [m].
+        origin: (D,) world position of the lower corner of tile (0, ..., 0) [m].
+        settings: arguments of an empty `LardHilbertMap` like those of the tiles.
+        dtype: dtype of the tiles' tensors, "float32" or "float64".
+        sampling: the `SamplingConfig` of the training points, as plain values.
+        fitting: the `FitConfig` of the tiles, as plain values.
+        seed: random seed of sampling, clustering and training.
+        tiles: entries of the fitted tiles by index. Tiles without points have none.
+
+    Raises:
+        ValueError: a field is out of range; the message names it.
     """
 
     edge: float
@@ -59,7 +61,6 @@ class Manifest:
     tiles: Mapping[Index, Tile] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """A ValueError that names the field."""
         check_number("edge", self.edge, 0.0)
         if not self.edge > 0:
             raise ValueError(f"edge must be > 0 m; got {self.edge}")
@@ -70,18 +71,13 @@ class Manifest:
         for name in ("settings", "sampling", "fitting", "tiles"):
             if not isinstance(getattr(self, name), Mapping):
                 raise ValueError(f"{name} must be a table; got {getattr(self, name)!r}")
-        if set(self.settings) != set(SETTINGS):
-            raise ValueError(f"settings must be {list(SETTINGS)}; got {sorted(self.settings)}")
-        for name in SETTINGS[:2]:
-            check_whole(f"settings.{name}", self.settings[name], 1)
-        for name in SETTINGS[2:]:
-            check_number(f"settings.{name}", self.settings[name], 0.0)
-            if not self.settings[name] > 0:
-                raise ValueError(f"settings.{name} must be > 0; got {self.settings[name]}")
+        _check_settings(self.settings)
         check_position("origin", self.origin, self.dim)
         for index, tile in self.tiles.items():
             if not isinstance(index, tuple) or len(index) != self.dim:
-                raise ValueError(f"tiles must have {self.dim} whole numbers a name; got {index!r}")
+                raise ValueError(
+                    f"tiles must be named by {self.dim} whole numbers each; got {index!r}"
+                )
             if len(tile.bounds[0]) != self.dim:
                 raise ValueError(
                     f"bounds of tile {tile_name(index)} must have {self.dim} coordinates; "
@@ -94,21 +90,32 @@ class Manifest:
         return int(self.settings["dim"])
 
 
-def write_manifest(folder: str | os.PathLike[str], manifest: Manifest) -> None:
-    """Write ``manifest.json``, atomically; the folder must exist."""
-    body = _to_json(manifest)
-    page = {"format_version": FORMAT_VERSION, "checksum": _body_checksum(body), "map": body}
-    with replaced_file(Path(folder) / MANIFEST_NAME) as partial:
-        partial.write_text(json.dumps(page, indent=1), encoding="utf-8")
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    if set(settings) != set(SETTINGS):
+        raise ValueError(f"settings must be {list(SETTINGS)}; got {sorted(settings)}")
+    for name in SETTINGS[:2]:
+        check_whole(f"settings.{name}", settings[name], 1)
+    for name in SETTINGS[2:]:
+        check_number(f"settings.{name}", settings[name], 0.0)
+        if not settings[name] > 0:
+            raise ValueError(f"settings.{name} must be > 0; got {settings[name]}")
 
 
-def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
-    """Read and check ``manifest.json``; nothing in it is trusted.
+def write_manifest(folder: Folder, manifest: Manifest) -> None:
+    """Write ``manifest.json`` atomically; the folder must exist."""
+    tiles = {tile_name(index): tile_to_json(tile) for index, tile in sorted(manifest.tiles.items())}
+    plain = {name: dict(getattr(manifest, name)) for name in ("settings", "sampling", "fitting")}
+    body = {**vars(manifest), **plain, "origin": list(manifest.origin), "tiles": tiles}
+    write_page(Path(folder) / MANIFEST_NAME, body)
+
+
+def read_manifest(folder: Folder) -> Manifest:
+    """Read and validate ``manifest.json``.
 
     Raises:
-        FileNotFoundError: the folder holds no manifest.
-        ValueError: the manifest is damaged, of another format, or a field is out of its range;
-            the error names it.
+        FileNotFoundError: the folder has no manifest.
+        ValueError: the manifest is damaged, has another format version, or a field is out of range;
+            the message names it.
     """
     path = Path(folder) / MANIFEST_NAME
     if not path.is_file():
@@ -116,37 +123,16 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
             f"{folder} must be the folder of a tiled map; it has no {path.name}"
         )
     try:
-        page = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} must be JSON, whole; {error}") from error
-    try:
-        version = page.get("format_version") if isinstance(page, dict) else None
-        if version != FORMAT_VERSION or isinstance(version, bool):
-            raise ValueError(
-                f"format_version must be {FORMAT_VERSION}; got {version!r}. "
-                "A newer map needs a newer lardhm_torch; an older folder must be made anew"
-            )
-        body = page.get("map")
-        if not isinstance(body, dict):
-            raise ValueError(f"map must be a table; got {type(body).__name__}")
-        if page.get("checksum") != _body_checksum(body):
-            raise ValueError("checksum must be that of the content; the file was damaged or edited")
-        return _from_json(body)
+        return _from_json(read_page(path))
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise ValueError(f"{path} must be the manifest of a tiled map; {error}") from error
-
-
-def _to_json(manifest: Manifest) -> dict[str, Any]:
-    tiles = {tile_name(index): tile_to_json(tile) for index, tile in sorted(manifest.tiles.items())}
-    plain = {name: dict(getattr(manifest, name)) for name in ("settings", "sampling", "fitting")}
-    return {**vars(manifest), **plain, "origin": list(manifest.origin), "tiles": tiles}
 
 
 def _from_json(body: dict[str, Any]) -> Manifest:
     fields = set(Manifest.__dataclass_fields__)
     if set(body) != fields:
         missing, unknown = sorted(fields - set(body)), sorted(set(body) - fields)
-        raise ValueError(f"map must have all fields and no others; {missing=}, {unknown=}")
+        raise ValueError(f"its fields must be those of a manifest; {missing=}, {unknown=}")
     if not isinstance(body["tiles"], dict):
         raise ValueError(f"tiles must be a table; got {type(body['tiles']).__name__}")
     tiles = {}
@@ -159,10 +145,48 @@ def _from_json(body: dict[str, Any]) -> Manifest:
     return Manifest(**{**body, "origin": position_from_json(body["origin"]), "tiles": tiles})
 
 
-def _body_checksum(body: Any) -> str:
+# --- JSON files with a version and a checksum ---
+
+
+def write_page(path: Path, body: dict[str, Any], *, durable: bool = True) -> None:
+    """Write a table of plain values as JSON, atomically, with format version and checksum.
+
+    ``durable`` is that of `replaced_file`.
+    """
+    page = {"format_version": FORMAT_VERSION, "checksum": body_checksum(body), "content": body}
+    with replaced_file(path, durable=durable) as partial:
+        partial.write_text(json.dumps(page), encoding="utf-8")
+
+
+def read_page(path: Path) -> dict[str, Any]:
+    """The table that `write_page` wrote.
+
+    Raises:
+        ValueError: the file is not JSON, has another version, or its checksum differs.
+    """
+    try:
+        page = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"it must be JSON, whole; {error}") from error
+    version = page.get("format_version") if isinstance(page, dict) else None
+    if version != FORMAT_VERSION or isinstance(version, bool):
+        raise ValueError(
+            f"format_version must be {FORMAT_VERSION}; got {version!r}. A newer folder needs a "
+            "newer lardhm_torch; an older one must be tiled and fitted again from its scans"
+        )
+    body = page.get("content")
+    if not isinstance(body, dict):
+        raise ValueError(f"content must be a table; got {type(body).__name__}")
+    if page.get("checksum") != body_checksum(body):
+        raise ValueError("checksum must be that of the content; the file was damaged or edited")
+    return body
+
+
+def body_checksum(body: Any) -> str:
+    """SHA-256 of plain values, independent of white space and order in the file, hexadecimal."""
     text = json.dumps(body, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _no_constant(name: str) -> Any:
+def _refuse_constant(name: str) -> Any:
     raise ValueError(f"numbers must be finite; got {name}")

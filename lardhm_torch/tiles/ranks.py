@@ -1,7 +1,7 @@
-"""Processes that share one job: who they are, and which piece of work each takes next.
+"""Ranks: processes that share the work on one folder, each taking the next free item.
 
-`torchrun` starts them, on one machine or many; its store is the only thing they talk through while
-they work. Without `torchrun` one process does the same alone.
+`torchrun` starts them, on one or several machines. While they work they communicate only through
+its store. Without `torchrun`, a single process does the same work alone.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Ranks:
     """One process of a job.
 
     Args:
-        store: what all processes see.
-        rank: which of them this is, from 0.
-        size: how many there are.
-        device: the one of this rank.
+        store: key-value store that all processes share.
+        rank: number of this process, from 0.
+        size: number of processes.
+        device: device of this process.
     """
 
     store: dist.Store
@@ -36,31 +36,31 @@ class Ranks:
     device: torch.device
 
     def take(self, name: str, work: Sequence[Work]) -> Iterator[Work]:
-        """Pieces of a list that every rank has, each to one rank: whoever is free takes the next."""
+        """Items of a list that is the same on all ranks; each item goes to exactly one rank."""
         while (number := self.store.add(f"taken/{name}", 1) - 1) < len(work):
             yield work[number]
 
     def count(self, name: str, more: int) -> int:
-        """Add to a number that all ranks share; what it is then."""
+        """Add to a counter that all ranks share, and return its new value."""
         return self.store.add(f"count/{name}", more)
 
     def agree(self, name: str, decide: Callable[[], Any]) -> Any:
-        """What rank 0 decides, a plain value, on all ranks."""
+        """Evaluate ``decide`` on rank 0 and return its result, a JSON value, on all ranks."""
         if self.rank == 0:
             self.store.set(f"agreed/{name}", json.dumps(decide()))
         return json.loads(self.store.get(f"agreed/{name}"))
 
     def wait(self) -> None:
-        """Until all ranks are here."""
+        """Block until all ranks have called this method."""
         if self.size > 1:
             dist.barrier()
 
 
 @contextmanager
 def join_ranks() -> Iterator[Ranks]:
-    """This process as a rank of the job that `torchrun` started, or as the only one.
+    """This process as a rank of the job that `torchrun` started, or as its only one.
 
-    nccl and one device a rank where there are GPUs, gloo elsewhere.
+    With GPUs the backend is nccl and each rank has a GPU of its own; otherwise it is gloo.
     """
     if not dist.is_torchelastic_launched():
         yield Ranks(dist.HashStore(), 0, 1, torch.get_default_device())
@@ -79,7 +79,7 @@ def join_ranks() -> Iterator[Ranks]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """A block on one thread: sums then do not depend on how many a machine has."""
+    """A context with one torch thread, in which sums do not depend on the number of cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,9 +1,8 @@
-"""Scans of any length to training points per tile, on disk, read and sampled a piece at a time."""
+"""Scans of any length to training points of tiles on disk, one piece of the scans at a time."""
 
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,36 +14,47 @@ from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.sampling import SamplingConfig, sample_rays, usable_rays
 from lardhm_torch.scans import Scans
-from lardhm_torch.tiles.cutting import Grid, grid_origin, route
-from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, read_manifest, write_manifest
-from lardhm_torch.tiles.places import Index
-from lardhm_torch.tiles.samples import (
+from lardhm_torch.tiles.indexing import Folder, Index, grid_origin
+from lardhm_torch.tiles.ledger import (
     LEDGER_NAME,
     Counts,
     Ledger,
-    Records,
-    append_records,
     appending,
     count_records,
     read_ledger,
     write_ledger,
 )
+from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, read_manifest, write_manifest
+from lardhm_torch.tiles.records import Grid, Records, append_records, route
 
-BUFFER_BYTES = 1 << 28  # records held before they are appended to their files
+BUFFER_BYTES = 1 << 28  # of records in memory, before they are appended to their files
+HALO = 0.5  # [m] by default
 
 
 @dataclass(frozen=True, kw_only=True)
 class TilingConfig:
-    """How the world is cut into tiles, and how scans become training points."""
+    """Size of the tiles, and how scans become training points.
 
-    edge: float = 20.0  # [m] of a tile
-    halo: float | None = (
-        None  # [m] around a tile, trained with it; None: 0.5 m, half an edge at most
-    )
-    seed: int = 0  # of everything random; piece n of the scans is sampled with seed + n
-    num_neighbors: int | None = None  # k of the maps; None: the default
+    Args:
+        edge: edge length of a tile [m].
+        halo: distance around a tile within which points of its neighbors help to train it [m].
+            None: 0.5 m, or half an edge if that is less.
+        seed: random seed; piece n of the scans is sampled with seed + n.
+        num_neighbors: k of the maps; None: the default of `LardHilbertMap`.
+        sampling: how rays are sampled.
+        fitting: how weights are trained. With ``batch_size=None``, a batch has 1 / 128 of the
+            points of a tile, at least 64.
+
+    Raises:
+        ValueError: edge is not > 0, or halo is more than half an edge.
+    """
+
+    edge: float = 20.0
+    halo: float | None = None
+    seed: int = 0
+    num_neighbors: int | None = None
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    fitting: FitConfig = field(default_factory=FitConfig)  # batch_size None: N / 128, at least 64
+    fitting: FitConfig = field(default_factory=FitConfig)
 
     def __post_init__(self) -> None:
         if not 0 < self.edge < float("inf"):
@@ -55,30 +65,28 @@ class TilingConfig:
 
 def tile_scans(
     pieces: Iterable[Scans],
-    folder: str | os.PathLike[str],
+    folder: Folder,
     config: TilingConfig | None = None,
     *,
     progress: bool = False,
 ) -> Ledger:
-    """Sample scans and route the training points to the tiles of a new folder.
+    """Sample scans and append the training points to the tiles of a new folder.
 
-    Memory is that of one piece and of `BUFFER_BYTES`. A run that was killed goes on where its last
-    points were written if it is called again with the same pieces, and ends with the same files.
-    Tiles begin at odd multiples of half an edge, so that the ground of a map near height 0 is not
-    cut, and so that any two folders with one edge and one world frame can be joined.
+    Needs memory for one piece and `BUFFER_BYTES`. After a kill, a call with the same pieces
+    continues where points were last written, and ends with the same files.
 
     Args:
         pieces: scans in pieces that fit in memory (`lardhm_torch.io.scan_files.iter_pieces`).
-        folder: is made; must not hold a tiled map that is complete.
+        folder: is created; must not hold a complete tiled map.
         config: edge, halo, seed, sampling.
-        progress: show a bar with the rate on a terminal.
+        progress: show a progress bar on a terminal.
 
     Returns:
-        What is in each tile.
+        Number of training points of each tile.
 
     Raises:
-        ValueError: the folder holds something else, the pieces are not those that it was begun
-            with, they differ in dimension, or no ray of all is usable.
+        ValueError: the folder holds other files, the pieces differ from those of the run that is
+            continued or from each other in dimension, or no ray is usable.
     """
     config, path = config or TilingConfig(), Path(folder)
     pieces = iter(pieces)
@@ -88,31 +96,35 @@ def tile_scans(
     manifest = _begin(path, first, config)
     with appending(path, manifest.dim) as ledger:
         router = _Router(path, manifest, config.sampling, ledger)
-        for piece in _watched(itertools.chain([first], pieces), progress):
+        for piece in _with_progress(itertools.chain([first], pieces), progress):
             router.take(piece)
         return router.finish()
 
 
 def add_scans(
-    pieces: Iterable[Scans], folder: str | os.PathLike[str], *, progress: bool = False
+    pieces: Iterable[Scans], folder: Folder, *, progress: bool = False
 ) -> tuple[Ledger, list[Index]]:
-    """Route more scans to the tiles of a folder: all of them or, if anything fails, none.
+    """Append the training points of more scans to a folder; if anything fails, none are added.
+
+    Args:
+        pieces: as for `tile_scans`.
+        folder: a folder that `tile_scans` completed.
+        progress: show a progress bar on a terminal.
 
     Returns:
-        What is in each tile now, and the tiles whose cores got new points, in order.
+        Number of training points of each tile now, and the tiles that contain new points, in order.
 
     Raises:
-        FileNotFoundError, ValueError: the folder is not one that `tile_scans` completed, or as
-            `tile_scans`.
+        FileNotFoundError, ValueError: the folder is not a complete tiled map, or see `tile_scans`.
     """
     manifest = read_manifest(folder)
     with appending(folder, manifest.dim) as before:
         if not before.complete:
             raise ValueError(
-                f"{folder} must be complete before scans are added; run `lardhm tile` to its end"
+                f"{folder} must be complete before scans are added; let `lardhm tile` finish"
             )
         router = _Router(Path(folder), manifest, SamplingConfig(**manifest.sampling), before)
-        for piece in _watched(pieces, progress):
+        for piece in _with_progress(pieces, progress):
             router.take(piece)
         after = router.finish()
     nothing = Counts()
@@ -121,8 +133,7 @@ def add_scans(
     ]
 
 
-def _watched(pieces: Iterable[Scans], progress: bool) -> Iterator[Scans]:
-    """The pieces, with a bar of their rays."""
+def _with_progress(pieces: Iterable[Scans], progress: bool) -> Iterator[Scans]:
     with tqdm(desc="rays", unit="ray", unit_scale=True, disable=None if progress else True) as bar:
         for piece in pieces:
             yield piece
@@ -130,13 +141,13 @@ def _watched(pieces: Iterable[Scans], progress: bool) -> Iterator[Scans]:
 
 
 def _begin(path: Path, first: Scans, config: TilingConfig) -> Manifest:
-    """The manifest of a new folder, or of one that was begun with the same settings."""
+    """Write and return the manifest of a new folder, or of one whose run is continued."""
     empty = LardHilbertMap(first.dim)
     if config.num_neighbors is not None:
         empty = LardHilbertMap(first.dim, config.num_neighbors)
     manifest = Manifest(
         edge=config.edge,
-        halo=min(0.5, config.edge / 2) if config.halo is None else config.halo,
+        halo=min(HALO, config.edge / 2) if config.halo is None else config.halo,
         origin=grid_origin(first.origins[0], config.edge),
         settings=empty.settings,
         sampling=asdict(config.sampling),
@@ -165,11 +176,11 @@ def _begin(path: Path, first: Scans, config: TilingConfig) -> Manifest:
 
 
 class _Router:
-    """Pieces of scans into the sample files of a folder.
+    """Appends the training points of scans, piece by piece, to the sample files of a folder.
 
-    The pieces of a new folder are counted from 0, and those that a killed run has routed already are
-    passed over. Those of an addition are counted on, so that no random number is drawn twice, and
-    count only once all are routed.
+    In a new folder, pieces are counted from 0, and those that an interrupted run finished are
+    skipped. When scans are added, counting continues, so that no random seed is used twice, and
+    records count only after the last piece.
     """
 
     def __init__(
@@ -183,7 +194,7 @@ class _Router:
         self.buffered = 0
 
     def take(self, piece: Scans) -> None:
-        """Sample one piece and keep its points, in memory or on disk."""
+        """Sample one piece; its records stay in memory until the buffer is full."""
         if piece.dim != self.manifest.dim:
             raise ValueError(
                 f"scans must have {self.manifest.dim} coordinates as the first; got {piece.dim}"
@@ -191,7 +202,7 @@ class _Router:
         seed = self.manifest.seed + self.chunks
         self.chunks, self.rays = self.chunks + 1, self.rays + len(piece)
         if self.chunks <= self.done.chunks:
-            self._check_place(self.chunks == self.done.chunks and self.rays != self.done.rays)
+            self._check_same_scans(self.chunks < self.done.chunks or self.rays == self.done.rays)
             return
         if not bool(usable_rays(piece, self.sampling)[0].any()):
             return
@@ -205,15 +216,15 @@ class _Router:
                 self._commit(complete=False)
 
     def finish(self) -> Ledger:
-        """All records to disk, and from now on they count."""
-        self._check_place(self.chunks < self.done.chunks)
+        """Write all records and the ledger that counts them."""
+        self._check_same_scans(self.chunks >= self.done.chunks)
         self._flush()
         if not self.tiles:
             raise ValueError("scans must hold at least one usable ray; got none")
         return self._commit(complete=True)
 
-    def _check_place(self, is_wrong: bool) -> None:
-        if is_wrong:
+    def _check_same_scans(self, is_same: bool) -> None:
+        if not is_same:
             raise ValueError(
                 f"scans must be those that {self.folder} was begun with, {self.done.rays} rays in "
                 f"the first {self.done.chunks} pieces; got {self.rays} in {self.chunks}"

@@ -1,10 +1,11 @@
-"""An ordinary map written as a folder of tiles."""
+"""One map to tiles, and the tensors of tiles to one map."""
 
 from __future__ import annotations
 
-import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,11 +13,13 @@ from torch import Tensor
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.learning.parameters import OF_THE_WHOLE
 from lardhm_torch.tiles.entries import tile_record
+from lardhm_torch.tiles.indexing import Folder, tile_indices, tile_path
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest
-from lardhm_torch.tiles.places import tile_indices, tile_path
+
+TileState = dict[str, Tensor]  # the tensors of a tile's map by name
 
 
-def split_map(model: LardHilbertMap, folder: str | os.PathLike[str], edge: float) -> None:
+def split_map(model: LardHilbertMap, folder: Folder, edge: float) -> None:
     """See `TiledMap.split`."""
     folder = Path(folder)
     if len(model) == 0:
@@ -31,19 +34,19 @@ def split_map(model: LardHilbertMap, folder: str | os.PathLike[str], edge: float
     )
     tile_path(folder, (0,)).parent.mkdir(parents=True, exist_ok=True)
     owners = tile_indices(model.centers.detach(), [0.0] * model.dim, edge)
-    places, owner, counts = torch.unique(owners, dim=0, return_inverse=True, return_counts=True)
+    indices, owner, counts = torch.unique(owners, dim=0, return_inverse=True, return_counts=True)
     tiles = {}
-    for place, rows in zip(
-        places.tolist(), owner.argsort(stable=True).split(counts.tolist()), strict=True
+    for index, rows in zip(
+        indices.tolist(), owner.argsort(stable=True).split(counts.tolist()), strict=True
     ):
-        tile, path = rows_of(model, rows), tile_path(folder, tuple(place))
+        tile, path = _select_clusters(model, rows), tile_path(folder, tuple(index))
         tile.save(path)
-        tiles[tuple(place)] = tile_record(tile, path, int(tile.counts.sum()))
+        tiles[tuple(index)] = tile_record(tile, path, int(tile.counts.sum()))
     write_manifest(folder, replace(manifest, tiles=tiles))
 
 
-def rows_of(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
-    """A map of some clusters of another, in its frame."""
+def _select_clusters(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
+    """A map of some of the clusters of another, in the same frame."""
     result = LardHilbertMap(**model.settings).to(model.centers)
     tensors = {
         name: tensor[rows] if isinstance(tensor, Tensor) and name not in OF_THE_WHOLE else tensor
@@ -51,3 +54,48 @@ def rows_of(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
     }
     result.load_state_dict(tensors)
     return result
+
+
+def state_of(model: LardHilbertMap) -> TileState:
+    """The tensors of a map by name, not copied."""
+    tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+    return {name: tensor.detach() for name, tensor in tensors.items()}
+
+
+@torch.no_grad()
+def join_states(
+    states: list[TileState], settings: Mapping[str, Any], origin: Tensor
+) -> LardHilbertMap:
+    """One map of the clusters of several.
+
+    Tensors of a map that has this origin already keep every bit. Posteriors are kept if all maps
+    have the same factors, as the tiles of one map do; otherwise they were not learned together, and
+    are dropped.
+
+    Args:
+        states: tensors of each map.
+        settings: arguments of `LardHilbertMap`.
+        origin: (D,) float64 origin of the result, world frame [m].
+    """
+    result = LardHilbertMap(**settings)
+    if states:
+        parts = [_in_frame(state, origin) for state in states]
+        tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        result = result.to(states[0]["centers"])
+        scales = torch.stack([state["posterior_scales"] for state in states])
+        if not torch.equal(scales, scales[:1].expand_as(scales)):
+            tensors["posterior_variances"].zero_()
+        whole = {"origin": origin, "posterior_scales": scales[0]}
+        result.load_state_dict({**tensors, **whole, "_extra_state": result.get_extra_state()})
+    result.origin = origin.clone()
+    return result.requires_grad_(False)
+
+
+def _in_frame(state: TileState, origin: Tensor) -> TileState:
+    """The tensors with a row for each cluster, with positions relative to another origin."""
+    tensors = {name: tensor for name, tensor in state.items() if name not in OF_THE_WHOLE}
+    if not torch.equal(state["origin"], origin):
+        for name in ("centers", "means"):
+            shift = state["origin"] - origin
+            tensors[name] = (tensors[name].double() + shift).to(tensors[name].dtype)
+    return tensors

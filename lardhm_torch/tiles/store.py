@@ -1,126 +1,76 @@
-"""Tiles on disk and in memory: read when asked for, checked, and forgotten when room is needed."""
+"""Reading and verifying tiles, and a cache of tiles and maps with a memory limit."""
 
 from __future__ import annotations
 
 import hashlib
-import os
+import json
 import warnings
 from collections import OrderedDict
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.io.map_files import check_settings, decode_safetensors
 from lardhm_torch.learning.parameters import OF_THE_WHOLE
 from lardhm_torch.tiles.entries import Tile
+from lardhm_torch.tiles.indexing import Folder, Index, tile_name, tile_path
 from lardhm_torch.tiles.manifest import Manifest
-from lardhm_torch.tiles.places import Index, tile_name, tile_path
-from lardhm_torch.tiles.tile_bytes import read_tensors
+from lardhm_torch.tiles.splitting import TileState, state_of
 
-TileState = dict[str, Tensor]  # the tensors of a tile's map by name
-BYTES_A_CLUSTER = 200  # of a 3-D float32 map with its index, no less than measured; float64 twice
+CLUSTER_BYTES = 200  # upper bound for a 3-D float32 map with its index; float64 takes twice as much
+Value = TypeVar("Value")
+Entries = OrderedDict[Hashable, tuple[Value, int]]  # values and their sizes in bytes
 
 
 class DamagedTileError(ValueError):
-    """A tile's file is missing, damaged, or not what the manifest says; ``index`` is the tile's."""
+    """The file of a tile is missing, damaged, or differs from the manifest.
+
+    Args:
+        index: index of the tile, also an attribute.
+        reason: what is wrong with the file.
+    """
 
     def __init__(self, index: Index, reason: str) -> None:
         super().__init__(
-            f"tile {tile_name(index)} of the map cannot be used; {reason}. Fit it again, or go on "
-            "without it: TiledMap.open(folder, skip_damaged=True)"
+            f"tile {tile_name(index)} of the map cannot be used; {reason}. Fit it again, or "
+            "continue without it: TiledMap.open(folder, skip_damaged=True)"
         )
         self.index = index
 
 
-class Cache:
-    """Maps and tiles by key, up to so many bytes.
-
-    When more is asked for than allowed, tiles go first: they are in the maps that were made of them.
-    Of tiles, and then of maps, those unused longest go.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.num_bytes = 0
-        self._tiles: OrderedDict[Hashable, tuple[TileState, int]] = OrderedDict()
-        self._maps: OrderedDict[Hashable, tuple[LardHilbertMap, int]] = OrderedDict()
-
-    def tile(self, key: Hashable) -> TileState | None:
-        """The tile of this key, if it is still there."""
-        return _latest(self._tiles, key)
-
-    def map(self, key: Hashable) -> LardHilbertMap | None:
-        """The map of this key, if it is still there."""
-        return _latest(self._maps, key)
-
-    def make_room(self, num_bytes: int) -> None:
-        """Forget until so much more fits."""
-        for entries in (self._tiles, self._maps):
-            while entries and self.num_bytes + num_bytes > self.limit:
-                _, (_, freed) = entries.popitem(last=False)
-                self.num_bytes -= freed
-
-    def put_tile(self, key: Hashable, state: TileState) -> None:
-        """Keep a tile, if it fits at all."""
-        self._put(self._tiles, key, state, state["centers"])
-
-    def put_map(self, key: Hashable, model: LardHilbertMap) -> None:
-        """Keep a map, if it fits at all."""
-        self._put(self._maps, key, model, model.centers)
-
-    def _put(self, entries: OrderedDict[Any, Any], key: Hashable, value: Any, rows: Tensor) -> None:
-        num_bytes = cluster_bytes(rows.shape[1], rows.dtype) * len(rows)
-        self.make_room(num_bytes)
-        if num_bytes <= self.limit:
-            entries[key] = (value, num_bytes)
-            self.num_bytes += num_bytes
-
-
-def _latest(entries: OrderedDict[Any, Any], key: Hashable) -> Any | None:
-    if key not in entries:
-        return None
-    entries.move_to_end(key)
-    return entries[key][0]
-
-
-def cluster_bytes(dim: int, dtype: torch.dtype) -> int:
-    """Bytes that a cluster takes in memory, with its part of the search index."""
-    return BYTES_A_CLUSTER * max(dim, 3) ** 2 // 9 * (dtype.itemsize // 4)
-
-
 class TileStore:
-    """Reads the tiles of one folder.
+    """Reads the tiles of a folder.
 
     Args:
-        folder: of the tiled map.
-        manifest: what it should hold.
-        skip_damaged: warn of a damaged tile, once, and take it for empty.
-        device: where tiles are put.
+        folder: folder of the tiled map.
+        manifest: its manifest.
+        skip_damaged: treat a damaged tile as empty, with one warning, instead of raising an error.
+        device: device of the tensors; None: the CPU.
     """
 
     def __init__(
         self,
-        folder: str | os.PathLike[str],
+        folder: Folder,
         manifest: Manifest,
         *,
         skip_damaged: bool = False,
-        device: Any = None,
+        device: torch.device | str | None = None,
     ) -> None:
         self.folder, self.manifest = folder, manifest
         self.skip_damaged, self.device = skip_damaged, device
-        self.dtype = getattr(torch, manifest.dtype)
-        empty = LardHilbertMap(**manifest.settings).to(self.dtype)
-        self._empty, self._extra = state_of(empty), empty.get_extra_state()
+        self.dtype: torch.dtype = getattr(torch, manifest.dtype)
+        self._empty = state_of(LardHilbertMap(**manifest.settings).to(self.dtype))
         self._warned: set[Index] = set()
 
     def load(self, index: Index) -> TileState:
-        """The tensors of one tile; those of an empty map if it is damaged and may be skipped.
+        """The tensors of a tile; those of an empty map if it is damaged and skipped.
 
         Raises:
-            DamagedTileError: its file is missing, damaged, or not what the manifest says.
+            DamagedTileError: its file is missing, damaged, or differs from the manifest.
         """
         try:
             state = self._load(index)
@@ -129,79 +79,97 @@ class TileStore:
                 raise
             if index not in self._warned:
                 self._warned.add(index)
-                warnings.warn(f"went on without a tile: {error}", stacklevel=2)
+                warnings.warn(f"a damaged tile was skipped: {error}", stacklevel=2)
             state = self._empty
         return {name: tensor.to(self.device) for name, tensor in state.items()}
 
     def _load(self, index: Index) -> TileState:
         path, entry = tile_path(self.folder, index), self.manifest.tiles[index]
         try:
-            content = bytearray(path.read_bytes())
+            content = path.read_bytes()
             if hashlib.sha256(content).hexdigest() != entry.checksum:
                 raise ValueError(
                     f"the checksum of {path} differs from the manifest's: it was damaged, or "
                     "updated after the map was opened"
                 )
-            state = read_tensors(content)
-            if state is not None and self._is_usual(state, entry.num_clusters):
-                return state
-            return self._read_slowly(path, entry)
+            state, metadata = decode_safetensors(content)
+            self._check(state, metadata, entry, path)
         except (OSError, ValueError) as error:
             raise DamagedTileError(index, str(error)) from error
+        return state
 
-    def _is_usual(self, state: dict[str, Any], num_clusters: int) -> bool:
-        """Whether a state dict is that of a map like all others here; takes its settings out."""
-        if state.pop("_extra_state", None) != self._extra or set(state) != set(self._empty):
-            return False
-        for name, empty in self._empty.items():
-            rows = empty.shape if name in OF_THE_WHOLE else (num_clusters, *empty.shape[1:])
-            if state[name].shape != rows or state[name].dtype != empty.dtype:
-                return False
-        return True
-
-    def _read_slowly(self, path: Path, entry: Tile) -> TileState:
-        model = LardHilbertMap.load(path)
-        found = {**model.settings, "dtype": model.centers.dtype, "num_clusters": len(model)}
-        wanted = {**self.manifest.settings, "dtype": self.dtype}
-        wanted["num_clusters"] = entry.num_clusters
+    def _check(self, state: TileState, metadata: dict[str, str], entry: Tile, path: Path) -> None:
+        """A ValueError unless settings, dtypes and shapes are those of the manifest."""
+        missing = [name for name in self._empty if name not in state]
+        if missing:
+            raise ValueError(f"{path} must hold the tensors of a map; missing: {missing}")
+        settings = check_settings(json.loads(metadata.get("_extra_state", "null")))
+        found = {"dtype": state["centers"].dtype, "num_clusters": len(state["centers"])}
+        wanted = {"dtype": self.dtype, "num_clusters": entry.num_clusters}
+        found, wanted = {**settings, **found}, {**self.manifest.settings, **wanted}
         for name, value in wanted.items():
-            if found[name] != value:
-                raise ValueError(f"{name} must be {value}; {path} has {found[name]}")
-        return state_of(model)
+            if found.get(name) != value:
+                raise ValueError(f"{name} must be {value}; {path} has {found.get(name)}")
+        for name, empty in self._empty.items():
+            rows = empty.shape if name in OF_THE_WHOLE else (entry.num_clusters, *empty.shape[1:])
+            if state[name].shape != rows or state[name].dtype != empty.dtype:
+                raise ValueError(
+                    f"{name} must be {tuple(rows)} of dtype {empty.dtype}; "
+                    f"{path} has {tuple(state[name].shape)} of dtype {state[name].dtype}"
+                )
 
 
-def state_of(model: LardHilbertMap) -> TileState:
-    """The tensors of a map by name, not copied."""
-    tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-    return {name: tensor.detach() for name, tensor in tensors.items()}
+class Cache:
+    """Maps and tiles by key, up to a number of bytes.
 
-
-@torch.no_grad()
-def joined(states: list[TileState], settings: Any, origin: Tensor) -> LardHilbertMap:
-    """One map of the clusters of all, in their order, in the frame of ``origin`` (D,) world [m].
-
-    Where that is a map's own frame its tensors keep every bit. Posteriors stay if they were learned
-    together, of one map that was split; posteriors with other factors are no posterior of the whole.
+    When room is needed, tiles are dropped before maps, because their clusters are also in the maps
+    that were made of them; among tiles and among maps, the least recently used are dropped first.
     """
-    result = LardHilbertMap(**settings)
-    if states:
-        parts = [_in_frame(state, origin) for state in states]
-        tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        result = result.to(states[0]["centers"])
-        scales = torch.stack([state["posterior_scales"] for state in states])
-        if not torch.equal(scales, scales[:1].expand_as(scales)):
-            tensors["posterior_variances"].zero_()
-        whole = {"origin": origin, "posterior_scales": scales[0]}
-        result.load_state_dict({**tensors, **whole, "_extra_state": result.get_extra_state()})
-    result.origin = origin.clone()
-    return result.requires_grad_(False)
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.num_bytes = 0
+        self._tiles: Entries[TileState] = OrderedDict()
+        self._maps: Entries[LardHilbertMap] = OrderedDict()
+
+    def tile(self, key: Hashable) -> TileState | None:
+        """The tile of this key, if it is in the cache."""
+        return _latest(self._tiles, key)
+
+    def map(self, key: Hashable) -> LardHilbertMap | None:
+        """The map of this key, if it is in the cache."""
+        return _latest(self._maps, key)
+
+    def make_room(self, num_bytes: int) -> None:
+        """Drop entries until ``num_bytes`` more fit, or the cache is empty."""
+        while self._tiles and self.num_bytes + num_bytes > self.limit:
+            self.num_bytes -= self._tiles.popitem(last=False)[1][1]
+        while self._maps and self.num_bytes + num_bytes > self.limit:
+            self.num_bytes -= self._maps.popitem(last=False)[1][1]
+
+    def put_tile(self, key: Hashable, state: TileState) -> None:
+        """Keep a tile, unless it is larger than the limit."""
+        self._put(self._tiles, key, state, state["centers"])
+
+    def put_map(self, key: Hashable, model: LardHilbertMap) -> None:
+        """Keep a map, unless it is larger than the limit."""
+        self._put(self._maps, key, model, model.centers)
+
+    def _put(self, entries: Entries[Value], key: Hashable, value: Value, centers: Tensor) -> None:
+        num_bytes = cluster_bytes(centers.shape[1], centers.dtype) * len(centers)
+        self.make_room(num_bytes)
+        if num_bytes <= self.limit:
+            entries[key] = (value, num_bytes)
+            self.num_bytes += num_bytes
 
 
-def _in_frame(state: TileState, origin: Tensor) -> TileState:
-    """All (M, ...) tensors of a map, positions relative to another origin."""
-    tensors = {name: tensor for name, tensor in state.items() if name not in OF_THE_WHOLE}
-    if not torch.equal(state["origin"], origin):
-        for name in ("centers", "means"):
-            shift = state["origin"] - origin
-            tensors[name] = (tensors[name].double() + shift).to(tensors[name].dtype)
-    return tensors
+def _latest(entries: Entries[Value], key: Hashable) -> Value | None:
+    if key not in entries:
+        return None
+    entries.move_to_end(key)
+    return entries[key][0]
+
+
+def cluster_bytes(dim: int, dtype: torch.dtype) -> int:
+    """Memory of a cluster in bytes, with its part of the search index."""
+    return CLUSTER_BYTES * max(dim, 3) ** 2 // 9 * (dtype.itemsize // 4)

@@ -1,12 +1,10 @@
-"""A map larger than memory: a folder of tiles that answers as one map would."""
+"""A map too large for memory: a folder of tiles that answers as one map would."""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,40 +12,60 @@ from torch import Tensor
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.learning import posterior
 from lardhm_torch.points import check_axes, check_points
-from lardhm_torch.tiles.grouping import lattice_parts, row_numbers, rows_by_number
+from lardhm_torch.tiles.blocks import lattice_parts, row_numbers, rows_by_number
+from lardhm_torch.tiles.indexing import Folder
+from lardhm_torch.tiles.local_maps import LocalMaps
 from lardhm_torch.tiles.manifest import Manifest, read_manifest
-from lardhm_torch.tiles.parts import Parts
 from lardhm_torch.tiles.splitting import split_map
 from lardhm_torch.tiles.store import TileStore
 
-MEMORY_LIMIT = 1 << 30  # bytes of clusters held at a time
+MEMORY_LIMIT = 1 << 30  # bytes of clusters in memory at a time
 WHOLE = ("weights", "centers", "raw_scale_tril", "scale_tril", "is_occupied", "counts")
 NUMBERS_AT_ONCE = 1 << 18  # points whose blocks are looked up at a time
+Corner = Tensor | Sequence[float]
 
 
 class TiledMap:
-    """Answers like a `LardHilbertMap` of all tiles together, and reads only those it needs.
+    """A map in a folder of tiles. It answers like the `LardHilbertMap` of all tiles together.
 
-    Points are grouped by blocks of a few tiles. A block is answered by one map of its own tiles and
-    of all others near enough to have a say (`layout` says which, and why the answers are those of
-    the whole map). Blocks and tiles stay in memory until the limit is reached; those unused longest
-    go first. Where no tile speaks nothing is read: probability 1/2.
+    Query points are grouped by blocks of a few tiles. A block is answered by a map of its own tiles
+    and of all others that contribute there (`layout` explains why the answers are those of the
+    whole map). Tiles and maps stay in memory up to a limit; the least recently used are dropped.
+    Where no tile contributes, nothing is read and the probability is 1/2.
 
-    A damaged tile raises `DamagedTileError` where its clusters might have a say; elsewhere the map
-    answers as before. Opened with ``skip_damaged`` it warns and goes on as if the tile were empty.
+    A damaged tile raises `DamagedTileError` where its clusters may contribute; elsewhere the map
+    answers as before. With ``skip_damaged``, a warning is issued and the tile is treated as empty.
 
-    `merge` makes an ordinary map, of all or of a part; `weights`, `centers` and the other tensors
-    of a map are those of the whole, if it fits the memory limit.
+    `merge` gives an ordinary map of all tiles or of a box. The attributes `weights`, `centers`,
+    `raw_scale_tril`, `scale_tril`, `is_occupied` and `counts` are those of the whole map, which
+    must then fit the memory limit.
+
+    Args:
+        folder: folder of the tiled map.
+        manifest: its manifest.
+        memory_limit: bytes of clusters in memory at a time.
+        skip_damaged: issue a warning for damaged tiles and continue without them.
+        device: device of the answers; None: the CPU.
+
+    Raises:
+        ValueError: memory_limit is not > 0.
     """
+
+    weights: Tensor
+    centers: Tensor
+    raw_scale_tril: Tensor
+    scale_tril: Tensor
+    is_occupied: Tensor
+    counts: Tensor
 
     def __init__(
         self,
-        folder: str | os.PathLike[str],
+        folder: Folder,
         manifest: Manifest,
         *,
         memory_limit: int = MEMORY_LIMIT,
         skip_damaged: bool = False,
-        device: Any = None,
+        device: torch.device | str | None = None,
     ) -> None:
         if not memory_limit > 0:
             raise ValueError(f"memory_limit must be > 0 bytes; got {memory_limit}")
@@ -59,45 +77,46 @@ class TiledMap:
         self.covariance_scale = float(manifest.settings["covariance_scale"])
         self.settings = dict(manifest.settings)
         store = TileStore(folder, manifest, skip_damaged=skip_damaged, device=device)
-        self._parts = Parts(store, self.memory_limit)
-        self.origin = self._parts.origin
+        self._local = LocalMaps(store, self.memory_limit)
+        self.origin = self._local.origin
 
     @classmethod
     def open(
         cls,
-        folder: str | os.PathLike[str],
+        folder: Folder,
         *,
         memory_limit: int = MEMORY_LIMIT,
         skip_damaged: bool = False,
-        device: Any = None,
+        device: torch.device | str | None = None,
     ) -> TiledMap:
-        """Read the manifest; tiles are read when they are needed.
+        """Open a folder. Only the manifest is read; tiles are read when they are needed.
 
         Args:
-            folder: of a tiled map.
-            memory_limit: bytes of clusters that are held at a time.
-            skip_damaged: warn of damaged tiles and go on without them.
-            device: of the answers; left out: the CPU.
+            folder: folder of the tiled map.
+            memory_limit: bytes of clusters in memory at a time.
+            skip_damaged: issue a warning for damaged tiles and continue without them.
+            device: device of the answers; None: the CPU.
 
         Raises:
-            FileNotFoundError: the folder holds no manifest.
-            ValueError: the manifest is damaged; the error names the field.
+            FileNotFoundError: the folder has no manifest.
+            ValueError: the manifest is damaged or has another format version.
         """
         manifest = read_manifest(folder)
-        options = {"memory_limit": memory_limit, "skip_damaged": skip_damaged, "device": device}
-        return cls(folder, manifest, **options)
+        return cls(
+            folder, manifest, memory_limit=memory_limit, skip_damaged=skip_damaged, device=device
+        )
 
     @staticmethod
-    def split(model: LardHilbertMap, folder: str | os.PathLike[str], edge: float) -> TiledMap:
+    def split(model: LardHilbertMap, folder: Folder, edge: float) -> TiledMap:
         """Write an ordinary map as a folder of tiles, and open it.
 
-        Clusters go to the tile that their center is in; nothing is rounded, so that `merge` gives
-        the map back, in the order of the tiles.
+        A cluster belongs to the tile that contains its center. Nothing is rounded: `merge` gives
+        the map back, with its clusters in the order of the tiles.
 
         Args:
             model: a fitted map.
-            folder: a new or empty one.
-            edge: of a tile [m].
+            folder: a new or empty folder.
+            edge: edge length of a tile [m].
 
         Raises:
             ValueError: the map is empty, or edge is not > 0.
@@ -106,11 +125,9 @@ class TiledMap:
         split_map(model, folder, edge)
         return TiledMap.open(folder)
 
-    # --- what the map is ---
-
     def __len__(self) -> int:
         """Number of clusters of all tiles."""
-        return int(self._parts.layout.counts.sum())
+        return int(self._local.layout.counts.sum())
 
     def __repr__(self) -> str:
         """What `print(model)` shows."""
@@ -120,13 +137,16 @@ class TiledMap:
             f"TiledMap({str(self.folder)!r}, {tiles} tiles, num_clusters={len(self)}, {settings})"
         )
 
-    def __getattr__(self, name: str) -> Any:
-        """Tensors of the whole map: those of `merge()`, if that fits the memory limit."""
+    def __bool__(self) -> bool:
+        """True, also for a map without clusters."""
+        return True
+
+    def __getattr__(self, name: str) -> Tensor:
+        """A tensor of the whole map, if that fits the memory limit."""
         if name not in WHOLE:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return getattr(self._parts.whole(), name)
-
-    # --- what the map answers ---
+        tensor: Tensor = getattr(self._local.whole(), name)
+        return tensor
 
     def __call__(self, points: Tensor) -> Tensor:
         """(..., D) world positions [m] -> (...) probability of occupancy."""
@@ -137,53 +157,52 @@ class TiledMap:
         return self._ask(points, lambda model, part: model.log_odds(part), 0.0)
 
     def variance(self, points: Tensor) -> Tensor:
-        """As `LardHilbertMap.variance`; the tiles' posteriors must be there."""
+        """`LardHilbertMap.variance`, if the map that was split has a posterior."""
         return self._ask(points, lambda model, part: model.variance(part), posterior.PRIOR_VARIANCE)
 
     def bayesian_probability(self, points: Tensor) -> Tensor:
-        """As `LardHilbertMap.bayesian_probability`; the tiles' posteriors must be there."""
+        """`LardHilbertMap.bayesian_probability`, if the map that was split has a posterior."""
         return self._ask(points, lambda model, part: model.bayesian_probability(part), 0.5)
 
     @torch.no_grad()
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """As `LardHilbertMap.query_lattice`, block by block."""
+        """`LardHilbertMap.query_lattice`, evaluated block by block."""
         check_axes(axes, self.dim)
-        shape, silent = [len(axis) for axis in axes], 0.5 if probability else 0.0
-        result = torch.full(shape, silent, dtype=self._dtype, device=self.origin.device)
-        layout = self._parts.layout
-        for place in lattice_parts(axes, layout.origin, layout.block_edge):
-            part = [axis[rows] for axis, rows in zip(axes, place, strict=True)]
+        shape, unknown = [len(axis) for axis in axes], 0.5 if probability else 0.0
+        result = torch.full(shape, unknown, dtype=self._dtype, device=self.origin.device)
+        for slices in lattice_parts(axes, self._local.layout):
+            part = [axis[rows] for axis, rows in zip(axes, slices, strict=True)]
             ends = [torch.stack([axis[0], axis.min(), axis.max()]).double().cpu() for axis in part]
             corner, *box = torch.stack(ends, dim=1)
-            number = int(self._parts.number(corner[None])[0])
+            number = int(self._local.block_numbers(corner[None])[0])
             if number >= 0:
-                model = self._parts.block(number, torch.stack(box))
-                result[place] = model.query_lattice(part, probability=probability)
+                model = self._local.of_block(number, torch.stack(box))
+                result[slices] = model.query_lattice(part, probability=probability)
         return result
 
     def thickness_counts(self) -> Counter[int]:
-        """As `surface.thickness_counts` of the merged map, from the manifest alone."""
+        """`raycasting.thickness_counts` of the merged map; no tile is read."""
         total: Counter[int] = Counter()
         for tile in self.manifest.tiles.values():
             total.update(tile.thickness_counts())
         return total
 
     def pieces(self) -> Iterator[LardHilbertMap]:
-        """The tiles' own maps, one after the other."""
-        return self._parts.pieces()
+        """The maps of the tiles, one at a time."""
+        return self._local.tile_maps()
 
-    def merge(self, bounds: tuple[Any, Any] | None = None) -> LardHilbertMap:
-        """An ordinary map that answers within ``bounds`` as this one does, in memory as a whole.
+    def merge(self, bounds: tuple[Corner, Corner] | None = None) -> LardHilbertMap:
+        """An ordinary map, in memory, that answers in a box as this map does.
 
         Args:
-            bounds: lower and upper corner (D,), world frame [m]; left out: everywhere.
+            bounds: lower and upper corner (D,) of the box, world frame [m]; None: everywhere.
 
         Raises:
-            DamagedTileError: a tile that it needs is damaged.
+            DamagedTileError: a needed tile is damaged.
             ValueError: bounds are not two corners, lower <= upper.
         """
         if bounds is None:
-            return self._parts.cut(None)
+            return self._local.merged(None)
         lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in bounds)
         good = lower.shape == upper.shape == (self.dim,)
         if not good or not bool((lower <= upper).all()):
@@ -191,79 +210,84 @@ class TiledMap:
                 f"bounds must be two corners of {self.dim} coordinates, lower <= upper; "
                 f"got {lower.tolist()} and {upper.tolist()}"
             )
-        return self._parts.cut((lower, upper))
+        return self._local.merged((lower, upper))
 
     @torch.no_grad()
     def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
-        """For N boxes, (N, D) world [m]: rows of those near each other, and a map for inside them.
+        """Groups of boxes that are near each other, and the map that answers in each group.
+
+        Args:
+            lower: (N, D) lower corners of the boxes, world frame [m].
+            upper: (N, D) upper corners [m].
+
+        Yields:
+            Rows of the boxes of a group, and a map.
 
         Raises:
-            ValueError: a part does not fit the memory limit.
+            ValueError: the map of a group does not fit the memory limit.
         """
         lower, upper = lower.detach().double().cpu(), upper.detach().double().cpu()
         middle = (lower + upper) / 2
-        layout = self._parts.layout
+        layout = self._local.layout
         index = ((middle - layout.origin) / layout.block_edge).floor()
         _, owner, counts = index.unique(dim=0, return_inverse=True, return_counts=True)
         for rows in owner.argsort(stable=True).split(counts.tolist()):
             box = lower[rows].amin(dim=0), upper[rows].amax(dim=0)
-            yield rows.to(self.origin.device), self._parts.box(*box)
-
-    # --- how ---
+            yield rows.to(self.origin.device), self._local.of_box(*box)
 
     def _ask(
-        self, points: Tensor, answer: Callable[[LardHilbertMap, Tensor], Tensor], silent: float
+        self, points: Tensor, answer: Callable[[LardHilbertMap, Tensor], Tensor], unknown: float
     ) -> Tensor:
-        """Answers of the blocks' maps at (..., D) points; ``silent`` where no tile speaks."""
+        """Answers of the blocks' maps at (..., D) points; ``unknown`` where no tile contributes."""
         points = torch.as_tensor(points, device=self.origin.device)
         check_points(points, self.dim)
         flat = points.reshape(-1, self.dim)
-        result = torch.full((len(flat),), silent, dtype=self._dtype, device=flat.device)
+        result = torch.full((len(flat),), unknown, dtype=self._dtype, device=flat.device)
         keeps_graph = torch.is_grad_enabled() and flat.requires_grad
-        where, answers = [], []
+        groups, answers = [], []
         for number, rows in self._rows_by_block(flat.detach(), result):
             part = flat[rows] if isinstance(rows, slice) else flat.index_select(0, rows)
-            model = self._parts.block(number, part)
+            model = self._local.of_block(number, part)
             if len(model) == 0:
                 continue
             if keeps_graph:
-                where.append(row_numbers(rows, flat.device))
+                groups.append(row_numbers(rows, flat.device))
                 answers.append(answer(model, part))
             else:
                 result[rows] = answer(model, part)
-        if keeps_graph:  # one node of the graph, however many blocks
+        if keeps_graph:  # a single node of the graph, independent of the number of blocks
             result = result + 0.0 * torch.nan_to_num(flat, 0.0, 0.0, 0.0).sum(dim=1).to(
                 result.dtype
             )
-            if where:
-                result = result.index_copy(0, torch.cat(where), torch.cat(answers))
+            if groups:
+                result = result.index_copy(0, torch.cat(groups), torch.cat(answers))
         return result.reshape(points.shape[:-1])
 
     def _rows_by_block(self, flat: Tensor, result: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
-        """Number of a block and rows of its points, for all points that any tile has a say in.
+        """Number of each block in which a tile contributes, and the rows of its points.
 
-        Points that are not finite get NaN in the result.
+        Sets the result to NaN for points that are not finite.
         """
         if len(flat) == 0:
             return
-        numbers = torch.cat([self._parts.number(some) for some in flat.split(NUMBERS_AT_ONCE)])
-        nowhere = (numbers < 0).nonzero().squeeze(1)  # all that are not finite are among them
-        for rows in nowhere.split(NUMBERS_AT_ONCE):
+        numbers = torch.cat([self._local.block_numbers(p) for p in flat.split(NUMBERS_AT_ONCE)])
+        outside = (numbers < 0).nonzero().squeeze(1)  # contains all points that are not finite
+        for rows in outside.split(NUMBERS_AT_ONCE):
             result[rows[~flat[rows].isfinite().all(dim=1)]] = torch.nan
         groups = rows_by_number(numbers)
-        del numbers, nowhere
+        del numbers, outside
         yield from groups
 
     @property
     def _dtype(self) -> torch.dtype:
-        return self._parts.store.dtype
+        return self._local.store.dtype
 
 
-def open_map(path: str | os.PathLike[str]) -> LardHilbertMap | TiledMap:
+def open_map(path: Folder) -> LardHilbertMap | TiledMap:
     """The map of a file, or the tiled map of a folder.
 
     Raises:
-        FileNotFoundError: there is no such file, or the folder holds no manifest.
+        FileNotFoundError: there is no such file, or the folder has no manifest.
         ValueError: the file or the manifest is damaged.
     """
     return TiledMap.open(path) if Path(path).is_dir() else LardHilbertMap.load(path)

@@ -1,19 +1,20 @@
-"""One tile from its points: clusters of its core, weights among the clusters of its neighbors.
+"""Clusters and weights of one tile.
 
-A tile of a large map is no map of its own. What it takes from the others, so that all together are
-as good as one map fitted at once (docs/scale.md has the measurements):
+Three things depend on the other tiles, so that all together are as accurate as one map that is
+fitted at once (measurements are in docs/scale.md):
 
-- how many clusters it gets: its share of the number that all points would get (`Budget`);
-- how much a point of each class counts in the loss: the same in every tile;
-- at its border, the clusters of its neighbors stand in their places while its weights are trained,
-  on the points just across the border too; what the neighbors' weights become there is dropped.
+- the number of clusters: a tile gets a part of the number for all points (`Budget`);
+- the weight of each class in the loss, which is the same in every tile;
+- the clusters of the neighbors near the border: they are included while the weights are trained,
+  and so are the points just outside the tile. The weights that the neighbors' clusters get here are
+  discarded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,44 +32,51 @@ from lardhm_torch.learning.clustering import (
 from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.points import in_morton_order
-from lardhm_torch.tiles.samples import OCCUPIED, Counts, TilePoints
+from lardhm_torch.tiles.indexing import Index
+from lardhm_torch.tiles.ledger import Counts
+from lardhm_torch.tiles.records import OCCUPIED, TilePoints
 
-# Clusters of best accuracy lie denser where points do, but less so: where there are twice the
-# points, 2^0.8 times the occupied and 2^0.6 times the free clusters.
+# The number of clusters that gives the best accuracy grows more slowly than the number of points:
+# for twice the points, 2^0.8 times the occupied and 2^0.6 times the free clusters.
 DENSITY_POWERS = (0.8, 0.6)
-LEAST_BATCH = 64  # a tile of few points needs steps enough, too
+LEAST_BATCH = 64  # a larger tile has 128 batches
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a tile's fit takes from the number of points in all tiles.
+    """Numbers that depend on the training points of all tiles and are needed to fit each.
 
     Args:
-        clusters_a_unit: of each class, occupied first: clusters of a tile with n points are this
-            times n to the class's power of density.
-        loss_factors: (2,) of a free and of an occupied point.
+        cluster_factors: factors f for the occupied and the free class. A tile with n points of a
+            class gets f n^p clusters, with the power p of `DENSITY_POWERS`.
+        loss_factors: weights of a free and of an occupied point in the loss.
     """
 
-    clusters_a_unit: tuple[float, float]
+    cluster_factors: tuple[float, float]
     loss_factors: tuple[float, float]
 
     def num_clusters(self, counts: Counts) -> tuple[int, int]:
-        """Of the occupied and of the free points of a tile."""
+        """Number of occupied and of free clusters of a tile."""
         occupied, free = (
-            min(max(1, n // MIN_COUNT), max(1, round(unit * n**power))) if n else 0
-            for n, unit, power in zip(counts, self.clusters_a_unit, DENSITY_POWERS, strict=False)
+            min(max(1, n // MIN_COUNT), max(1, round(factor * n**power))) if n else 0
+            for n, factor, power in zip(counts, self.cluster_factors, DENSITY_POWERS, strict=False)
         )
         return occupied, free
 
 
-def make_budget(tiles: Mapping[Any, Counts], config: FitConfig) -> Budget:
-    """One cluster a class for every `POINTS_PER_CLUSTER` hits of all tiles, shared out by density.
+def make_budget(tiles: Mapping[Index, Counts], config: FitConfig) -> Budget:
+    """The budget of a folder.
 
-    The classes share the loss over all tiles as they do over all points of one map.
+    Over all tiles, each class gets one cluster for every `POINTS_PER_CLUSTER` hits, and the class
+    weights of the loss are those of one map of all points.
+
+    Args:
+        tiles: numbers of training points of all tiles.
+        config: class weights.
     """
     hits, free = (sum(counts[kind] for counts in tiles.values()) for kind in (0, 1))
     total = max(1.0, (hits or free) / POINTS_PER_CLUSTER)
-    units = [
+    cluster_factors = [
         total / max(1.0, sum(counts[kind] ** power for counts in tiles.values()))
         for kind, power in enumerate(DENSITY_POWERS)
     ]
@@ -76,11 +84,11 @@ def make_budget(tiles: Mapping[Any, Counts], config: FitConfig) -> Budget:
     if config.balance:
         counts = torch.tensor([free, hits], dtype=torch.double)
         factors = class_factors(counts[0], counts[1], config.occupied_share)
-    return Budget((units[0], units[1]), (float(factors[0]), float(factors[1])))
+    return Budget((cluster_factors[0], cluster_factors[1]), (float(factors[0]), float(factors[1])))
 
 
 class TileClusters(NamedTuple):
-    """M clusters, and (M,) which of them are occupied."""
+    """M clusters, and whether each is occupied, (M,) bool."""
 
     clusters: Clusters
     is_occupied: Tensor
@@ -89,11 +97,11 @@ class TileClusters(NamedTuple):
 def cluster_tile(
     tile: TilePoints, num_clusters: tuple[int, int], rng: torch.Generator
 ) -> TileClusters:
-    """Both classes of a tile's core, clustered apart; the occupied clusters first.
+    """Cluster each class of the points inside a tile; the occupied clusters come first.
 
     Args:
-        tile: points of the core, in any order; those of the halo are left out.
-        num_clusters: of the occupied and of the free points.
+        tile: points in any order; copies in the halo are ignored.
+        num_clusters: number of occupied and of free clusters.
         rng: random state.
     """
     classes = [tile.core_points(label) for label in (OCCUPIED, 0)]
@@ -108,14 +116,17 @@ def train_tile(
     budget: Budget,
     task: TrainingTask,
 ) -> tuple[Tensor, Tensor]:
-    """(M,) weights and (M, D, D) raw factors of a tile's own clusters.
+    """Train the weights of a tile.
 
     Args:
-        tile: points of the core and of the halo, in any order.
-        own: M clusters of the core.
-        around: the neighbors' clusters that reach into the halo, same frame.
-        budget: what a point counts.
+        tile: points inside the tile and in its halo, in any order.
+        own: M clusters of the tile.
+        around: clusters of the neighbors near the border, in the same frame.
+        budget: class weights.
         task: kernel, settings, random state.
+
+    Returns:
+        (M,) weights and (M, D, D) raw factors of the tile's own clusters.
     """
     clusters = concatenate_clusters([own.clusters, around.clusters])
     raw = raw_factors(factor_covariances(clusters.covariances, task.kernel.min_lengthscale))
@@ -142,7 +153,7 @@ def train_tile(
 
 
 class TrainingTask(NamedTuple):
-    """What the training of every tile needs beside points and clusters."""
+    """Settings of the training, and its random state."""
 
     kernel: Kernel
     config: FitConfig

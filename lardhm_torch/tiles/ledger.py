@@ -1,0 +1,142 @@
+"""The ledger of a tiled folder: how many training points of each tile count.
+
+Files of training points only grow. Records behind those that the ledger counts were left by a
+killed run; the next writer truncates them. The files are not forced to the disk (that would take
+milliseconds for each tile): one that a power failure truncated is recognized by its size.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lardhm_torch.tiles.indexing import Folder, Index, tile_index, tile_name
+from lardhm_torch.tiles.manifest import read_page, write_page
+from lardhm_torch.tiles.records import Records, record_type
+
+LEDGER_NAME, LOCK_NAME = "samples.json", "samples.lock"
+
+
+class Counts(NamedTuple):
+    """Numbers of records of a tile: its hits, its free points, and copies from its neighbors."""
+
+    hits: int = 0
+    free: int = 0
+    halo: int = 0
+
+    @property
+    def core(self) -> int:
+        """Number of points inside the tile."""
+        return self.hits + self.free
+
+    def plus(self, other: Counts) -> Counts:
+        """The sums."""
+        return Counts(*(ours + theirs for ours, theirs in zip(self, other, strict=True)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ledger:
+    """Which records count, and which part of the scans they come from.
+
+    Args:
+        tiles: number of records of each tile.
+        chunks: number of pieces of the scans whose points are in the files.
+        rays: number of rays in those pieces.
+        complete: whether these are all scans.
+    """
+
+    tiles: Mapping[Index, Counts] = field(default_factory=dict)
+    chunks: int = 0
+    rays: int = 0
+    complete: bool = False
+
+    @property
+    def cores(self) -> list[Index]:
+        """Tiles that contain points, not only copies from neighbors; in order."""
+        return sorted(index for index, counts in self.tiles.items() if counts.core)
+
+
+def count_records(records: Records) -> Counts:
+    """Numbers of records by kind."""
+    free, hits, *halo = np.bincount(records["kind"], minlength=4).tolist()
+    return Counts(hits, free, sum(halo))
+
+
+def write_ledger(folder: Folder, ledger: Ledger) -> None:
+    """Write the ledger atomically; from then on its records count."""
+    tiles = {tile_name(index): list(counts) for index, counts in sorted(ledger.tiles.items())}
+    write_page(Path(folder) / LEDGER_NAME, {**vars(ledger), "tiles": tiles})
+
+
+def read_ledger(folder: Folder) -> Ledger:
+    """The ledger of a folder.
+
+    Raises:
+        FileNotFoundError: there is none: the folder has no training points.
+        ValueError: it is damaged or has another format version.
+    """
+    path = Path(folder) / LEDGER_NAME
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{folder} must hold the training points of its tiles; it has no {path.name}. "
+            "`lardhm tile` writes it"
+        )
+    try:
+        body = read_page(path)
+        tiles = {tile_index(name): Counts(*map(int, row)) for name, row in body["tiles"].items()}
+        return Ledger(**{**body, "tiles": tiles})
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} must be the ledger of a tiled map, whole; {error}") from error
+
+
+@contextmanager
+def appending(folder: Folder, dim: int) -> Iterator[Ledger]:
+    """A context in which records are appended; yields the ledger.
+
+    At its start, and if it fails, records that do not count are removed from the files.
+
+    Raises:
+        ValueError: another process is appending, or a file is shorter than the ledger says.
+    """
+    with open(Path(folder) / LOCK_NAME, "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ValueError(
+                f"{folder} must have one writer at a time; another process adds points to it"
+            ) from error
+        try:
+            yield _roll_back(folder, dim)
+        except BaseException:
+            _roll_back(folder, dim)
+            raise
+
+
+def _roll_back(folder: Folder, dim: int) -> Ledger:
+    """Remove all records that the ledger does not count."""
+    ledger = read_ledger(folder)
+    parent = Path(folder) / "samples"
+    parent.mkdir(exist_ok=True)
+    size = record_type(dim).itemsize
+    wanted = {tile_name(index): size * sum(counts) for index, counts in ledger.tiles.items()}
+    with os.scandir(parent) as entries:
+        found = {entry.name: entry.stat().st_size for entry in entries}
+    for name, length in found.items():
+        if name not in wanted:
+            (parent / name).unlink()
+        elif length > wanted[name]:
+            os.truncate(parent / name, wanted[name])
+    short = [name for name, length in wanted.items() if found.get(name, 0) < length]
+    if short:
+        raise ValueError(
+            f"{parent / short[0]} must hold {wanted[short[0]]} bytes; got {found.get(short[0], 0)}. "
+            "The file was truncated: tile the scans again"
+        )
+    return ledger
