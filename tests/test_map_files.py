@@ -112,6 +112,16 @@ def test_a_map_of_real_scans_comes_back_from_safetensors(data, safe_path):
     assert torch.equal(LardHilbertMap.load(safe_path)(points), model(points))
 
 
+def test_equal_maps_have_equal_files(safe_path, path):
+    model = some_map()
+    for target in (safe_path, path):
+        contents = set()
+        for _ in range(10):
+            model.save(target)
+            contents.add(target.read_bytes())
+        assert len(contents) == 1
+
+
 def test_who_may_read_a_map_follows_the_umask(safe_path, path):
     before = os.umask(0o027)
     try:

@@ -173,7 +173,19 @@ def _write_safetensors(state: Mapping[str, Any], path: Path) -> None:
     other = {name: json.dumps(value) for name, value in state.items() if name not in tensors}
     metadata = {"format": "pt", "checksum": _checksum(tensors, other), **other}
     # `save_file` would replace the file by one that only its owner can read.
-    path.write_bytes(safetensors_torch.save(tensors, metadata))
+    path.write_bytes(_with_sorted_metadata(safetensors_torch.save(tensors, metadata)))
+
+
+def _with_sorted_metadata(content: bytes) -> bytes:
+    """The same file with metadata in order: safetensors writes them in random order.
+
+    Equal maps then have equal files, as joining and comparing folders of tiles requires.
+    """
+    header_end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:header_end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return content[:8] + text.ljust(header_end - 8) + content[header_end:]
 
 
 def _read_safetensors(path: Path) -> dict[str, Any]:
