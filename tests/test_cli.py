@@ -299,6 +299,8 @@ def test_what_are_no_scans_is_an_error_of_one_line(bad, monkeypatch, capsys, com
         ("mesh map.pt -o m.ply --resolution 1e-9", "--resolution must be at least"),
         ("grid map.pt -o g.npz --resolution nan", "--resolution must be > 0 m"),
         ("view map.pt --export v.html --resolution inf", "--resolution must be > 0 m"),
+        ("view map.pt --export v.html --port 99999", "--port must be 1 to 65535"),
+        ("view map.pt --export v.html --host 203.0.113.1", "must be an address of this machine"),
         ("fit scans.npz -o o.pt --clusters 0", "num_clusters must be"),
         ("fit scans.npz -o o.pt --neighbors 0", "num_neighbors must be"),
         ("fit scans.npz -o o.pt --dim 0", "0 coordinates; got 3"),
@@ -421,7 +423,14 @@ def test_a_warning_is_one_line_without_its_source(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["fly"], ["fit"], ["fit", "a.npz", "-o", "m.pt", "--origin", "x"]]
+    "words",
+    [
+        [],
+        ["fly"],
+        ["fit"],
+        ["fit", "a.npz", "-o", "m.pt", "--origin", "x"],
+        ["render", "m.pt", "-o", "a.png", "--slice", "nan"],
+    ],
 )
 def test_an_invalid_command_line_exits_with_code_2(words, capsys):
     with pytest.raises(SystemExit) as stopped:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import Any
 
 from lardhm_torch.cli import learning, queries, tiling
@@ -161,18 +162,18 @@ def _picture_verbs(verb: Any) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
     _output(sub, "picture to write: .png")
     sub.add_argument(
-        "--slice", type=float, metavar="Z", help="draw the probability at height Z [m] instead"
+        "--slice", type=_finite, metavar="Z", help="draw the probability at height Z [m] instead"
     )
     _resolution(sub, 0.05)
     _surface(sub)
     sub.add_argument(
-        "--azimuth", type=float, default=-60.0, help="camera azimuth [degrees] (default: -60)"
+        "--azimuth", type=_finite, default=-60.0, help="camera azimuth [degrees] (default: -60)"
     )
     sub.add_argument(
-        "--elevation", type=float, default=40.0, help="camera elevation [degrees] (default: 40)"
+        "--elevation", type=_finite, default=40.0, help="camera elevation [degrees] (default: 40)"
     )
     sub.add_argument(
-        "--cut-above", type=float, metavar="Z", help="remove the surface above height Z [m]"
+        "--cut-above", type=_finite, metavar="Z", help="remove the surface above height Z [m]"
     )
 
 
@@ -261,6 +262,16 @@ def _numbers(text: str) -> tuple[float, ...]:
         raise argparse.ArgumentTypeError(
             f"must be numbers separated by commas; got {text!r}"
         ) from error
+
+
+def _finite(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a finite number; got {text!r}")
+    return value
 
 
 def _output(sub: argparse.ArgumentParser, text: str) -> None:

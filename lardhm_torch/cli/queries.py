@@ -79,6 +79,7 @@ def view(arguments: argparse.Namespace) -> None:
     if arguments.export is not None:
         inputs = [arguments.map, *arguments.scans]
         check_output(arguments.export, EXPORT_SUFFIXES, inputs, option="--export")
+    _check_address(arguments.host, arguments.port)
     model = open_map(arguments.map)
     if arguments.resolution is not None:
         _check_resolution(model, arguments.resolution)
@@ -96,6 +97,20 @@ def view(arguments: argparse.Namespace) -> None:
         print("stopped")
     finally:
         viewer.close()
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raise an error if no server can listen there; the server's own thread would report none."""
+    import socket
+
+    if not 0 < port < 1 << 16:
+        raise ValueError(f"--port must be 1 to 65535; got {port}")
+    try:
+        family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise OSError(f"--host must be an address of this machine; got {host}: {error}") from error
 
 
 def render(arguments: argparse.Namespace) -> None:
