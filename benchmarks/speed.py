@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from conditions import ROOT, conditions, describe, write_json
+from default_query import default_query
 from growth import floor, growth_clusters, growth_points, growth_scans, memory
 from table_two import (
     NUM_CLUSTERS,
@@ -221,6 +222,7 @@ def kmeans(arguments: argparse.Namespace) -> Result:
 
 PARTS: dict[str, Callable[[argparse.Namespace], Result]] = {
     "query": query,
+    "default_query": default_query,
     "train": train,
     "stages": stages,
     "kmeans": kmeans,
@@ -238,6 +240,7 @@ def parse_arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--rays", type=int, default=120_000, help="rays a set of default_query")
     parser.add_argument("--max-points", type=int, default=10**6, help="of growth_points")
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "speed.json")
     return parser.parse_args(argv)
