@@ -37,10 +37,11 @@ from lardhm_torch.learning.fitting import fit_weights
 
 Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
 
-HEAD = """# What each choice is worth
+HEAD = """# Ablation study
 
-Balanced accuracy unif / near in percent and log-loss unif / near, one thing changed at a time; at most
-{rays:,} rays of a set, half of them train, seed {seed}. Written by `benchmarks/choices.py`.
+Balanced accuracy unif / near in percent, and log-loss unif / near, with one change at a time; at most
+{rays:,} rays of a set, half of which train, seed {seed}. The defaults were chosen on these sets.
+Produced by `benchmarks/choices.py`.
 
 """
 
