@@ -189,12 +189,12 @@ def markdown(results: dict[str, dict[str, Scores]], names: list[str]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument("--sets", nargs="+", help="names of folders; default: all 3-D sets")
-    parser.add_argument("--choices", nargs="+", help="names of rows; default: all")
+    parser.add_argument("--sets", nargs="+", help="names of folders (default: all 3-D sets)")
+    parser.add_argument("--choices", nargs="+", help="names of rows (default: all)")
     parser.add_argument("--rays", type=int, default=30_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "choices.json")
-    parser.add_argument("--markdown", type=Path, help="where the table goes")
+    parser.add_argument("--markdown", type=Path, help="file to write the table to")
     arguments = parser.parse_args()
     sets = find_sets(arguments.data, arguments.sets)
     chosen = {name: CHOICES[name] for name in arguments.choices or CHOICES}

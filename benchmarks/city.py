@@ -227,10 +227,16 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--scans", type=int, default=40, help="of 32,000 rays each (40)")
-    parser.add_argument("--spacing", type=float, default=5.0, help="between two scans [m] (5)")
-    parser.add_argument("--edge", type=float, default=20.0, help="of a tile [m] (20)")
-    parser.add_argument("--ranks", type=int, default=0, help="under torchrun; 0: in this process")
+    parser.add_argument(
+        "--scans", type=int, default=40, help="scans of 32,000 rays each (default: 40)"
+    )
+    parser.add_argument(
+        "--spacing", type=float, default=5.0, help="distance between scans [m] (default: 5)"
+    )
+    parser.add_argument("--edge", type=float, default=20.0, help="edge of a tile [m] (default: 20)")
+    parser.add_argument(
+        "--ranks", type=int, default=0, help="ranks under torchrun; 0: in this process (default: 0)"
+    )
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "city")
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "city.json")
     arguments = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Maps that learn scan by scan: accuracy against all scans at once, time a scan, growth, fading.
+"""Updates scan by scan: accuracy compared with all scans at once, time per scan, growth, fading.
 
 python benchmarks/incremental.py                       # all parts
 python benchmarks/incremental.py --only speed growth
@@ -299,7 +299,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--sets", nargs="+", default=list(SETS))
     parser.add_argument("--only", nargs="+", choices=[part.__name__ for part in PARTS])
-    parser.add_argument("--seed", type=int, default=0, help="of the split in accuracy")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="random seed of the split of the accuracy part (default: 0)",
+    )
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "incremental.json")
     arguments = parser.parse_args()
     missing = [name for name in arguments.sets if not (arguments.data / name).is_dir()]

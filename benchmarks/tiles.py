@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--limit", type=int, default=384, help="memory limit of the map [MiB]")
     parser.add_argument("--repeats", type=int, default=1)
-    parser.add_argument("--folder", help="where the map is, or will be, kept")
+    parser.add_argument("--folder", help="folder of the map; it is created if it does not exist")
     parser.add_argument("--orders", nargs="*", default=("grouped", "random"))
     parser.add_argument("--order", choices=("grouped", "random"), default="grouped")
     parser.add_argument("--measure", choices=("single", "tiled"))

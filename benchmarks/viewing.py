@@ -68,7 +68,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--set", default="balm_realworld")
     parser.add_argument("--most-points", type=int, default=ViewConfig().max_points)
-    parser.add_argument("--picture", type=Path, help="screenshots are written beside it")
+    parser.add_argument(
+        "--picture", type=Path, help="file to write; screenshots are written beside it"
+    )
     arguments = parser.parse_args()
     print(describe(conditions()))
     scans = load_scans(arguments.data / arguments.set / "scans.npz")

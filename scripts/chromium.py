@@ -1,4 +1,4 @@
-"""The Chromium that opens the viewer's page for its picture, its benchmark and its tests."""
+"""Start Chromium for the screenshot, the benchmark and the tests of the viewer."""
 
 from __future__ import annotations
 

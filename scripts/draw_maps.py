@@ -1,7 +1,7 @@
-"""The pictures of the README: fit a map to real scans, mesh it, draw it.
+"""Draw the pictures of docs/accuracy.md: fit maps to real scans and draw their meshes.
 
 Usage: python scripts/draw_maps.py DATA [-o docs/pictures]
-DATA is the folder that holds one folder for each set, with its `scans.npz`.
+DATA is a folder with one folder per set, which contains `scans.npz`.
 """
 
 import argparse

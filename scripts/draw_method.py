@@ -1,4 +1,4 @@
-"""The method in four pictures, in two dimensions: points, clusters, one and eight neighbors.
+"""Draw the method in two dimensions: points, clusters, and maps with one and eight neighbors.
 
 Usage: python scripts/draw_method.py [PICTURE]    (default: docs/pictures/method.png)
 """

@@ -1,9 +1,9 @@
-"""Feed broken files to every reader: the answer is Scans or a clear error, never a hang or crash.
+"""Feed damaged files to every reader: it must return Scans or raise a clear error.
 
     python scripts/fuzz_readers.py --mutations 1000 --seed 0
 
-Each format runs in a process of its own, with a limit on time and memory, so that a crash in a
-compiled library is seen and named. Exit code 0 if all formats pass.
+Each format runs in its own process with limits on time and memory, so that a crash of a compiled
+library is detected and reported. Exit code 0 if all formats pass.
 """
 
 from __future__ import annotations
@@ -230,10 +230,12 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
 def main() -> int:
     """Fuzz formats one after the other here, or each in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("formats", nargs="*", help=f"{', '.join(FORMATS)}; all that can be read")
-    parser.add_argument("--mutations", type=int, default=1000, help="files per format (1000)")
+    parser.add_argument("formats", nargs="*", help=f"{', '.join(FORMATS)} (default: all)")
+    parser.add_argument(
+        "--mutations", type=int, default=1000, help="files per format (default: 1000)"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--here", action="store_true", help="in this process")
+    parser.add_argument("--here", action="store_true", help="run in this process")
     arguments = parser.parse_args()
     names = arguments.formats or available_formats()
     if not arguments.here:

@@ -1,9 +1,9 @@
-"""A path around furniture by gradient descent: Adam moves the waypoints of a straight line.
+"""Plan a path around furniture by gradient descent on its waypoints.
 
-A robot of 25 cm radius crosses the simulated room. The cost is the length of the path, plus what its
-straight pieces expect to meet, plus a push away from obstacles that are too near: all are functions
-of the map, so autograd gives the gradient. Descent finds the nearest valley only, so it starts from
-lines bent to both sides, and the cheapest path is kept.
+A robot of 25 cm radius crosses the simulated room. The cost is the length of the path, plus the hazard
+of its segments, plus a penalty on small clearance. All are differentiable functions of the map. Since
+gradient descent finds a local minimum, it starts from lines curved to both sides, and the path with
+the lowest cost is kept.
 
 Usage: python scripts/plan_path.py [PICTURE]    (default: docs/pictures/question_path.png)
 """

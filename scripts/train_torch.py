@@ -1,7 +1,7 @@
-"""Train a map with plain PyTorch: your own loop instead of `fine_tune`.
+"""Train a map with your own PyTorch loop instead of `fine_tune`.
 
-A DataLoader, any optimizer, BCEWithLogitsLoss on `model.log_odds`, a schedule, clipped gradients, a
-running average of the parameters, and a checkpoint every epoch from which the run goes on.
+The loop uses a DataLoader, AdamW, BCEWithLogitsLoss on `model.log_odds`, a learning rate schedule,
+gradient clipping, averaged parameters, and a checkpoint per epoch from which the run resumes.
 
 Usage: python scripts/train_torch.py SCANS -o map.pt [--epochs 8] [--checkpoint run.pt]
 """
@@ -77,5 +77,7 @@ if __name__ == "__main__":
     parser.add_argument("--epochs", type=int, default=8)
     parser.add_argument("--batch", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--checkpoint", help="written every epoch; the run goes on if it exists")
+    parser.add_argument(
+        "--checkpoint", help="written every epoch; the run resumes from it if it exists"
+    )
     main(parser.parse_args())
