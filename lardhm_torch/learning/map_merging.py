@@ -103,6 +103,9 @@ def merge_maps(first: Any, second: Any, *, seed: int = 0) -> Any:
             `LardHilbertMap.transform`).
         seed: of the recalled points and the training.
 
+    Returns:
+        A new map, in the frame of the first.
+
     Raises:
         ValueError: the settings differ.
 
