@@ -144,7 +144,11 @@ def iter_scans(
     Each file is read when it is needed, so that a folder of any length needs the memory of one file.
 
     Args:
-        path, origin, frame, topic, camera: see `load_scans`.
+        path: a file, a folder, or several of them.
+        origin: see `load_scans`.
+        frame: see `load_scans`.
+        topic: see `load_scans`.
+        camera: see `load_scans`.
 
     Yields:
         One scan each, as `Scans` with a single origin.
