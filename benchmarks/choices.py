@@ -109,7 +109,7 @@ CHOICES = {
 
 
 def build(train: Scans, choice: Choice, seed: int) -> Model:
-    """A map of the training rays, made this way."""
+    """Fit a map to the training rays with these settings."""
     sampling = SamplingConfig(**choice.sampling)
     samples = sample_rays(train, sampling, seed=seed)
     model = LardHilbertMap(dim=train.dim, **choice.model)
@@ -136,7 +136,7 @@ def build(train: Scans, choice: Choice, seed: int) -> Model:
 
 
 def _with_kernel(model: LardHilbertMap, points: Tensor, labels: Tensor, kernel: Kernel) -> Model:
-    """The same clusters under another kernel, with weights trained for it."""
+    """Fit the weights of the same clusters with another kernel."""
 
     def features_at(positions: Tensor) -> tuple[Tensor, Tensor]:
         local = model._to_map_frame(positions)
@@ -161,7 +161,7 @@ def _with_kernel(model: LardHilbertMap, points: Tensor, labels: Tensor, kernel: 
 
 
 def markdown(results: dict[str, dict[str, Scores]], names: list[str]) -> str:
-    """One row a choice; the mean over the sets first."""
+    """Table with one row per choice; the first columns are means over the sets."""
     lines = [
         "| choice | mean | mean log-loss | " + " | ".join(names) + " |",
         "|---" * (len(names) + 3) + "|",

@@ -127,7 +127,7 @@ def train(arguments: argparse.Namespace) -> Result:
 
 
 def sgd_schedule(num_points: int) -> tuple[int, int]:
-    """Passes and batch size of our defaults, for the contender that trains in plain torch."""
+    """Passes and batch size of the defaults, for the system that trains in plain torch."""
     config = FitConfig()
     return config.passes, config.batch_size or max(256, num_points // 128)
 

@@ -21,7 +21,7 @@ RESOLUTION = {"sevenscenes_rgbd": 0.03, "riegl_vz400i_rtls": 0.06, "balm_realwor
 
 
 def main() -> None:
-    """One picture for each set."""
+    """Draw one picture per set."""
     parser = argparse.ArgumentParser(description="Draw the maps of real scans.")
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/pictures"))

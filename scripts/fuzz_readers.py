@@ -40,7 +40,7 @@ from lardhm_torch import LardHilbertMap
 from lardhm_torch.io.scan_files import load_points, load_scans, save_scans
 from lardhm_torch.scans import Scans
 
-SECONDS_A_FILE = 5  # of the processor
+SECONDS_A_FILE = 5  # processor time
 MEMORY_ON_TOP = 1 << 30  # [bytes] that a reader may need for a file of some kilobytes
 NUM_POINTS = 300
 HUGE = (0, 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
@@ -149,11 +149,11 @@ def mutate(content: bytes, rng: np.random.Generator) -> bytes:
             at = int(rng.integers(min(len(changed) - 8, 400)))
             at = at if rng.random() < 0.7 else len(changed) - 8 - at % len(changed[8:])
             changed[at : at + width] = number.to_bytes(width, "little")
-        elif kind == 5 and changed:  # a piece said twice or left out
+        elif kind == 5 and changed:  # a block repeated or removed
             start, stop = sorted(rng.integers(len(changed) + 1, size=2))
             changed[start:stop] = changed[start:stop] * int(rng.integers(3))
             del changed[4 * len(content) :]
-        elif kind == 6:  # noise put in
+        elif kind == 6:  # random bytes inserted
             at = rng.integers(len(changed) + 1)
             changed[at:at] = rng.bytes(int(rng.integers(1, 30)))
     return bytes(changed)
@@ -195,12 +195,12 @@ def fuzz(name: str, mutations: int, seed: int) -> Counter[str]:
         assert outcome(name, named) == "read"
         for number in range(mutations):
             broken = mutate(content, np.random.default_rng([seed, number]))
-            if name == "e57" and number % 4:  # else the first checksum is all that is tested
+            if name == "e57" and number % 4:  # otherwise only the first checksum would be tested
                 broken = checksums_mended(broken)
             path.write_bytes(broken)
             print(f"{name}: mutation {number} of seed {seed}", file=sys.stderr)
             signal.setitimer(signal.ITIMER_PROF, SECONDS_A_FILE)
-            signal.alarm(60 * SECONDS_A_FILE)  # on the clock: it may wait for ever, too
+            signal.alarm(60 * SECONDS_A_FILE)  # wall time: a reader may also wait forever
             try:
                 counts[outcome(name, named)] += 1
             finally:

@@ -33,7 +33,9 @@ def at_height(path: Tensor, height: float) -> Tensor:
 
 def cost(model: LardHilbertMap, path: Tensor) -> Tensor:
     """Length [m], obstacles met, and too little clearance, of (W, 2) waypoints."""
-    total = 2 * (WAYPOINTS - 1) * path.diff(dim=0).square().sum()  # short, and even pieces
+    total = (
+        2 * (WAYPOINTS - 1) * path.diff(dim=0).square().sum()
+    )  # short, with segments of equal length
     for height in HEIGHTS:
         points = at_height(path, height)
         total = total + 10 * segment_hazard(model, points[:-1], points[1:]).sum()

@@ -21,7 +21,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent / "paper"))
 
-EXPERIMENTS = {  # name: module, in the order they run; times first, while the machine is cool
+EXPERIMENTS = {  # name: module, in the order of execution; times first
     "table_one": "timings",
     "table_two": "timings",
     "figure_one": "rings",

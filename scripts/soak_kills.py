@@ -31,7 +31,7 @@ from lardhm_torch import (
 from lardhm_torch.evaluation.held_out import evaluate
 from lardhm_torch.scans import concatenate_scans
 
-TOLERANCE = 0.005  # of the accuracy
+TOLERANCE = 0.005  # largest difference of accuracy
 STREAM = Path(__file__).with_name("stream.py")
 
 
@@ -76,11 +76,11 @@ def run_killed(files: list[Path], target: Path, kills: int, rng: random.Random) 
                 process.send_signal(signal.SIGKILL)
                 process.communicate()
                 killed += 1
-                _, done = resume_stream(target)  # the file is whole
+                _, done = resume_stream(target)  # raises if the file is damaged
                 if done.scans < before:
                     sys.exit(f"kill {killed}: {before} scans became {done.scans}")
                 if done.scans == before:
-                    patience += 0.5  # it was killed before it learned a scan
+                    patience += 0.5  # killed before the first scan was finished
                 before = done.scans
                 continue
         else:

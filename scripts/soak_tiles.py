@@ -83,7 +83,7 @@ def run_killed(folder: Path, kills: int, rng: random.Random) -> int:
     while killed < kills:
         process = start(folder)
         while process.poll() is None and finished(folder) == done:
-            time.sleep(0.005)  # until the ranks have begun to work
+            time.sleep(0.005)  # until the ranks have started
         try:
             process.communicate(timeout=rng.uniform(0.0, spread))
         except subprocess.TimeoutExpired:
@@ -95,7 +95,7 @@ def run_killed(folder: Path, kills: int, rng: random.Random) -> int:
         if not done <= now:
             sys.exit(f"kill {killed}: finished work was lost: {sorted(done - now)[:5]}")
         if read_manifest(folder) != before:
-            break  # it was killed after the tiles were taken over
+            break  # killed after the tiles were moved into place
         print(
             f"kill {killed}: {len(now)} pieces of work are done, {len(now - done)} new", flush=True
         )

@@ -109,7 +109,7 @@ def _update(sub: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         metavar="FILE",
-        help="map to write, MAP itself is allowed; a tiled map is updated in place without it",
+        help="map to write, which may be MAP itself; omit it for a tiled map, which is updated in place",
     )
     _clusters(sub, "clusters of a scan of an unknown place (default: chosen from the data)")
     _radius(sub)
