@@ -1,8 +1,10 @@
-# make demo   set-up and the main job: simulate a room, fit a map, evaluate it, draw it (out/)
-# make test   set-up, checks and tests
-# make docs   set-up and the documentation (out/docs/index.html); a warning is an error
-# make bench  set-up and the benchmarks (minutes)
-# make soak   set-up and the long checks: fuzzing, flipped bits, kills (tens of minutes)
+# Every target first installs the package into .venv.
+#
+# make demo   simulate a room, fit a map, evaluate it and draw it (out/)
+# make test   run linter, type checker and tests
+# make docs   build the documentation (out/docs/index.html); warnings are errors
+# make bench  run the benchmarks (minutes)
+# make soak   run the long tests: fuzzing, flipped bits, kills (tens of minutes)
 
 PYTHON ?= python3
 BIN := .venv/bin

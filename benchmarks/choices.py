@@ -1,7 +1,7 @@
-"""What each choice behind the defaults is worth: one thing changed at a time, on every set.
+"""Ablation study: the effect of each default, one change at a time, on every set.
 
-Protocol of accuracy.py, fewer rays so that all choices take minutes. Rows of the table are choices,
-columns sets; a cell is balanced accuracy unif / near in percent.
+The protocol is that of accuracy.py, with fewer rays so that all choices take minutes. Rows of the
+table are choices, columns are sets; a cell is balanced accuracy unif / near in percent.
 
     python benchmarks/choices.py --data ../shared/data --markdown docs/choices.md
 """
@@ -37,10 +37,11 @@ from lardhm_torch.learning.fitting import fit_weights
 
 Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
 
-HEAD = """# What each choice is worth
+HEAD = """# Ablation study
 
-Balanced accuracy unif / near in percent and log-loss unif / near, one thing changed at a time; at most
-{rays:,} rays of a set, half of them train, seed {seed}. Written by `benchmarks/choices.py`.
+Balanced accuracy unif / near in percent, and log-loss unif / near, with one change at a time; at most
+{rays:,} rays of a set, half of which train, seed {seed}. The defaults were chosen on these sets.
+Produced by `benchmarks/choices.py`.
 
 """
 
@@ -77,38 +78,38 @@ PAPERS_SGD = {
     "l2": 0.0,
 }
 CHOICES = {
-    "**default, tuned**": Choice(),
+    "**default, fine-tuned**": Choice(),
     "k = 8": Choice(model={"num_neighbors": 8}),
     "k = 24": Choice(model={"num_neighbors": 24}),
     "covariance scale 2.5": Choice(model={"covariance_scale": 2.5}),
     "covariance scale 8": Choice(model={"covariance_scale": 8.0}),
-    "a cluster for 10 hits": Choice(hits_per_cluster=10),
-    "a cluster for 15 hits": Choice(hits_per_cluster=15),
-    "a cluster for 30 hits": Choice(hits_per_cluster=30),
+    "one cluster per 10 hits": Choice(hits_per_cluster=10),
+    "one cluster per 15 hits": Choice(hits_per_cluster=15),
+    "one cluster per 30 hits": Choice(hits_per_cluster=30),
     "no near samples": Choice(sampling={"near_samples": 0}),
     "1 near sample": Choice(sampling={"near_samples": 1}),
     "3 free samples a ray": Choice(sampling={"free_samples": 3}),
     "near margin 0.2 m": Choice(sampling={"near_margin": 0.2}),
     "near margin 0.05 m": Choice(sampling={"near_margin": 0.05}),
-    "classes weigh the same": Choice(fit={"occupied_share": 0.5}, tune={"occupied_share": 0.5}),
+    "equal class weights": Choice(fit={"occupied_share": 0.5}, tune={"occupied_share": 0.5}),
     "same samples every epoch": Choice(resample=False),
-    "tuned with l2 = 0.05": Choice(tune={"l2": 0.05}),
+    "fine-tuned with l2 = 0.05": Choice(tune={"l2": 0.05}),
     "no stiffness": Choice(tune={"stiffness": 0.0}),
     "24 epochs": Choice(tune={"epochs": 24}),
     "best epoch on 10 % of the rays": Choice(tune={"hold_out": 0.1}),
     "length-scales frozen": Choice(tune={"tune_scales": False}),
     "centers frozen": Choice(tune={"tune_centers": False}),
-    "**default, not tuned**": Choice(tune=None),
-    "k = 8, not tuned": Choice(model={"num_neighbors": 8}, tune=None),
+    "**default, not fine-tuned**": Choice(tune=None),
+    "k = 8, not fine-tuned": Choice(model={"num_neighbors": 8}, tune=None),
     "the paper's SGD": Choice(fit=PAPERS_SGD, tune=None),
-    "Matern 1/2, not tuned": Choice(tune=None, kernel=lambda d: torch.exp(-d)),
-    "Matern 3/2, not tuned": Choice(tune=None, kernel=matern_three_halves),
-    "Wendland, not tuned": Choice(tune=None, kernel=wendland),
+    "Matern 1/2, not fine-tuned": Choice(tune=None, kernel=lambda d: torch.exp(-d)),
+    "Matern 3/2, not fine-tuned": Choice(tune=None, kernel=matern_three_halves),
+    "Wendland, not fine-tuned": Choice(tune=None, kernel=wendland),
 }
 
 
 def build(train: Scans, choice: Choice, seed: int) -> Model:
-    """A map of the training rays, made this way."""
+    """Fit a map to the training rays with these settings."""
     sampling = SamplingConfig(**choice.sampling)
     samples = sample_rays(train, sampling, seed=seed)
     model = LardHilbertMap(dim=train.dim, **choice.model)
@@ -135,7 +136,7 @@ def build(train: Scans, choice: Choice, seed: int) -> Model:
 
 
 def _with_kernel(model: LardHilbertMap, points: Tensor, labels: Tensor, kernel: Kernel) -> Model:
-    """The same clusters under another kernel, with weights trained for it."""
+    """Fit the weights of the same clusters with another kernel."""
 
     def features_at(positions: Tensor) -> tuple[Tensor, Tensor]:
         local = model._to_map_frame(positions)
@@ -160,7 +161,7 @@ def _with_kernel(model: LardHilbertMap, points: Tensor, labels: Tensor, kernel: 
 
 
 def markdown(results: dict[str, dict[str, Scores]], names: list[str]) -> str:
-    """One row a choice; the mean over the sets first."""
+    """Table with one row per choice; the first columns are means over the sets."""
     lines = [
         "| choice | mean | mean log-loss | " + " | ".join(names) + " |",
         "|---" * (len(names) + 3) + "|",
@@ -188,12 +189,12 @@ def markdown(results: dict[str, dict[str, Scores]], names: list[str]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument("--sets", nargs="+", help="names of folders; default: all 3-D sets")
-    parser.add_argument("--choices", nargs="+", help="names of rows; default: all")
+    parser.add_argument("--sets", nargs="+", help="names of folders (default: all 3-D sets)")
+    parser.add_argument("--choices", nargs="+", help="names of rows (default: all)")
     parser.add_argument("--rays", type=int, default=30_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "choices.json")
-    parser.add_argument("--markdown", type=Path, help="where the table goes")
+    parser.add_argument("--markdown", type=Path, help="file to write the table to")
     arguments = parser.parse_args()
     sets = find_sets(arguments.data, arguments.sets)
     chosen = {name: CHOICES[name] for name in arguments.choices or CHOICES}

@@ -1,4 +1,4 @@
-"""A simulated city of any size, tiled and fitted: time a point, memory, disk.
+"""Tile and fit a simulated city of any size: time per point, memory, disk.
 
 A scanner drives along the streets of a grid of blocks; houses and parked cars follow from the number
 of the block, so that no more of the city is held than is in sight. The scans go straight into the
@@ -52,7 +52,7 @@ def block_boxes(block: tuple[int, int]) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=rng)
 
     corner = PITCH * torch.tensor(block) + STREET
-    side = (PITCH - 2 * STREET) / 2  # of the lot of one of four houses
+    side = (PITCH - 2 * STREET) / 2  # edge of the lot of one of four houses
     lots = corner + side * torch.cartesian_prod(torch.arange(2), torch.arange(2))
     houses = torch.cat([lots + draw(0, 4, 4, 2), lots + side - draw(0, 4, 4, 2)], dim=1)
     along = corner[0] + torch.arange(4) * side / 2 + draw(0, 4, 4)
@@ -78,7 +78,7 @@ def boxes_in_sight(place: Tensor) -> Tensor:
 
 
 def scan_at(place: Tensor, seed: int) -> Scans:
-    """What a spinning scanner sees from (2,) in a street."""
+    """Scan of a rotating scanner at (2,) in a street."""
     rng = torch.Generator().manual_seed(seed)
     turn = 2 * torch.pi * (torch.arange(COLUMNS) + torch.rand((), generator=rng)) / COLUMNS
     tilt = torch.deg2rad(torch.linspace(LOWEST, HIGHEST, RINGS))
@@ -108,7 +108,7 @@ def scan_at(place: Tensor, seed: int) -> Scans:
 
 
 def city_scans(count: int, spacing: float, seed: int = 0) -> Iterator[Scans]:
-    """A drive up and down the streets of a square city that fits so many scans."""
+    """Scanner positions of a drive through a square city with room for so many scans."""
     streets = max(1, round((count * spacing / PITCH) ** 0.5))
     length = count * spacing / streets
     for number in range(count):
@@ -118,7 +118,7 @@ def city_scans(count: int, spacing: float, seed: int = 0) -> Iterator[Scans]:
 
 
 class Stopwatch:
-    """Time that a stream takes to be made, apart from what is done with it."""
+    """Measure the time that it takes to produce a stream."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -135,7 +135,7 @@ class Stopwatch:
 
 
 def single_fits(folder: Path, ledger: Ledger) -> tuple[float, float]:
-    """Processor seconds a point of some tiles' own points as maps of their own, median of the tiles.
+    """Processor time per point [s] of some tiles fitted as single maps, median of the tiles.
 
     Returns:
         From the file of points to the map's file, as a tile of the folder is made; and of that the
@@ -169,7 +169,7 @@ def _at_share(ledger: Ledger, ranked: list[Any], share: float) -> Any:
 
 
 def fit_city(folder: Path, ranks: int) -> tuple[float, float]:
-    """Seconds and processor seconds of all tiles' fit; under torchrun with its start."""
+    """Time and processor time [s] to fit all tiles, including the start of torchrun if it is used."""
     start, begin = time.perf_counter(), sum(os.times()[:4])
     if ranks == 0:
         fit_tiles(folder, progress=True)
@@ -181,7 +181,7 @@ def fit_city(folder: Path, ranks: int) -> tuple[float, float]:
 
 
 def peak_gib() -> float:
-    """Most memory that this process, or the largest of its children, ever held [GiB]."""
+    """Peak memory of this process, or of the largest of its children [GiB]."""
     who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     return max(resource.getrusage(w).ru_maxrss for w in who) / 2**20
 
@@ -228,10 +228,16 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--scans", type=int, default=40, help="of 32,000 rays each (40)")
-    parser.add_argument("--spacing", type=float, default=5.0, help="between two scans [m] (5)")
-    parser.add_argument("--edge", type=float, default=20.0, help="of a tile [m] (20)")
-    parser.add_argument("--ranks", type=int, default=0, help="under torchrun; 0: in this process")
+    parser.add_argument(
+        "--scans", type=int, default=40, help="scans of 32,000 rays each (default: 40)"
+    )
+    parser.add_argument(
+        "--spacing", type=float, default=5.0, help="distance between scans [m] (default: 5)"
+    )
+    parser.add_argument("--edge", type=float, default=20.0, help="edge of a tile [m] (default: 20)")
+    parser.add_argument(
+        "--ranks", type=int, default=0, help="ranks under torchrun; 0: in this process (default: 0)"
+    )
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "city")
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "city.json")
     arguments = parser.parse_args()

@@ -1,4 +1,4 @@
-"""What a figure was measured on: machine, versions, commit. Every benchmark records it."""
+"""Machine, versions and commit, which every benchmark records."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def conditions() -> dict[str, Any]:
 
 
 def processor() -> str:
-    """Name of the processor as the system tells it."""
+    """Name of the processor, as reported by the system."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -42,7 +42,7 @@ def processor() -> str:
 
 
 def version(name: str) -> str | None:
-    """Installed version of a distribution, None where it is not installed."""
+    """Installed version of a distribution; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -50,7 +50,7 @@ def version(name: str) -> str | None:
 
 
 def commit() -> str:
-    """Commit of the code that ran; "+ changes" where the files differ from it."""
+    """Commit of the code, with "+ changes" if the files differ from it."""
     try:
         name = _git("rev-parse", "--short", "HEAD")
         return name + (" + changes" if _git("status", "--porcelain") else "")
@@ -74,14 +74,14 @@ def describe(record: dict[str, Any]) -> str:
 
 
 def busy(load: float | None) -> str:
-    """A warning line where others were using the machine when the run began, else nothing."""
+    """A warning if the machine was busy when the run began; otherwise nothing."""
     if load is None or load < BUSY_LOAD:
         return ""
     return f"\nWARNING: load average {load:.1f} before the start; times are not to be trusted"
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write the figures of a run, making the folder."""
+    """Write the figures of a run; the folder is created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=2) + "\n")
     print(f"wrote {path}")

@@ -1,4 +1,4 @@
-"""A made-up street of any length, and a laser scanner that drives along it."""
+"""A synthetic street of any length, and a laser scanner that drives along it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOISE = 0.02  # [m] standard deviation of a range
 def street_scan(
     place: float, num_rays: int, seed: int, box: tuple[Tensor, Tensor] | None = None
 ) -> Scans:
-    """What a scanner at x = ``place`` in the middle of the street sees.
+    """Scan of a scanner at x = ``place`` in the middle of the street.
 
     Args:
         place: how far it has driven [m].

@@ -1,4 +1,4 @@
-"""How time and memory grow with a map, and the floor that the machine sets: parts of speed.py."""
+"""Growth of time and memory with a map, and the lower bound of the machine: parts of speed.py."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workers import peak_memory
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays
 
 FIXED, DENSE = "500,000 points", "40 points a cluster"
-CANDIDATES = 26  # centers a point is compared with, of the floor's count of operations
+CANDIDATES = 26  # centers per point in the count of operations of the lower bound
 Result = dict[str, Any]
 
 
@@ -27,7 +27,7 @@ Result = dict[str, Any]
 
 
 def growth_clusters(arguments: argparse.Namespace) -> Result:
-    """Query time a point as the map grows from 500 to 200,000 clusters, random order.
+    """Query time per point as the map grows from 500 to 200,000 clusters, random order.
 
     Once with as many points for every map, and once with as many points a cluster.
     """
@@ -48,7 +48,7 @@ def growth_clusters(arguments: argparse.Namespace) -> Result:
 
 
 def growth_points(arguments: argparse.Namespace) -> Result:
-    """Training time a point as scene and number of clusters grow with the points."""
+    """Training time per point as the scene and the number of clusters grow with the points."""
     rows = []
     for count in (10**exponent for exponent in range(4, 8)):
         if count > arguments.max_points:
@@ -66,14 +66,14 @@ def growth_points(arguments: argparse.Namespace) -> Result:
 
 
 def growth_scans(arguments: argparse.Namespace) -> Result:
-    """Time of one more scan as a map is built from many (needs `LardHilbertMap.update`)."""
+    """Time of one more scan as a map is built from many scans."""
     model: Any = LardHilbertMap(dim=3, num_neighbors=NUM_NEIGHBORS)
     if not hasattr(model, "update"):
         note = "skipped: this version of LardHilbertMap has no update"
         return {"title": "Growth with scans", "rows": [{"scans": 0}], "notes": [note]}
     rows = []
     points, labels = labelled_hills(2_000 * 1_000)
-    strips = points[:, 0].argsort().split(2_000)  # a walk over the hills, one strip a scan
+    strips = points[:, 0].argsort().split(2_000)  # a walk over the hills, one strip per scan
     seconds: list[float] = []
     for number, strip in enumerate(strips, start=1):
         add = partial(model.update, points[strip], labels[strip], num_clusters=20)
@@ -96,21 +96,21 @@ def time_once(run: Callable[[], Any]) -> float:
 
 
 def query_job(num_points: int) -> Callable[[], Any]:
-    """Ten million points and the map they are put to."""
+    """Ten million points, and the map that is queried with them."""
     model, points = made_up_map(NUM_CLUSTERS), queries(NUM_CLUSTERS, num_points)
     model(points[:1])
     return lambda: model(points)
 
 
 def fit_job(path: Path, num_clusters: int) -> Callable[[], Any]:
-    """All samples of a set, and the map that learns them."""
+    """All samples of a set, and the map that is fitted to them."""
     samples = sample_rays(load_scans(path), seed=0)
     model = LardHilbertMap(dim=3)
     return lambda: model.fit(samples.points, samples.labels, num_clusters=num_clusters)
 
 
 def memory(arguments: argparse.Namespace) -> Result:
-    """Peak memory on top of the input, in fresh processes."""
+    """Peak memory beyond the input, in new processes."""
     count, path = 10_000_000, arguments.data / "riegl_vz400i_rtls" / "scans.npz"
     jobs: dict[str, tuple[Any, ...]] = {
         f"query of {count:,} points (output of {4 * count / 1e6:.0f} MB included)": (
@@ -125,7 +125,7 @@ def memory(arguments: argparse.Namespace) -> Result:
 
 
 def floor(arguments: argparse.Namespace) -> Result:
-    """What the machine needs at least for the grid of Table II, from its measured rates."""
+    """Lower bound of the time for the grid of Table II, from the measured rates of the machine."""
     task = load_task(arguments.data)
     model = fit_map(task)
     timed = compare("q", [Contender("q", lambda: model(task.grid))], arguments.repeats, 1)
@@ -147,7 +147,7 @@ def floor(arguments: argparse.Namespace) -> Result:
 
 
 def measured_bandwidth(repeats: int) -> float:
-    """Bytes a second, read and written, of a copy far larger than the caches."""
+    """Rate of a copy that is much larger than the caches [bytes/s], read and written."""
     source = torch.ones(64 << 20)
     target = torch.empty_like(source)
     timed = compare("copy", [Contender("copy", lambda: target.copy_(source))], repeats, 1)
@@ -155,7 +155,7 @@ def measured_bandwidth(repeats: int) -> float:
 
 
 def measured_rate(repeats: int) -> float:
-    """Float32 operations a second of a matrix product."""
+    """Rate of a matrix product [float32 operations/s]."""
     left, right = torch.rand(1024, 1024), torch.rand(1024, 1024)
     timed = compare("product", [Contender("product", lambda: left @ right)], repeats, 1)
     return 2 * 1024**3 / (timed["rows"][0]["median_ms"] / 1e3)

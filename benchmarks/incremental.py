@@ -1,4 +1,4 @@
-"""Maps that learn scan by scan: accuracy against all scans at once, time a scan, growth, fading.
+"""Updates scan by scan: accuracy compared with all scans at once, time per scan, growth, fading.
 
 python benchmarks/incremental.py                       # all parts
 python benchmarks/incremental.py --only speed growth
@@ -54,7 +54,7 @@ Row = dict[str, Any]
 
 
 def single_scans(scans: Scans) -> list[Scans]:
-    """One Scans each, with its own origin alone, as they come from files."""
+    """One Scans per scan, with a single origin, as `iter_scans` returns them."""
     return [
         Scans(scans.origins[number : number + 1], part.ends, None, part.is_return)
         for number in scans.scan_id.unique().tolist()
@@ -82,7 +82,7 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
 
 
 def accuracy(arguments: argparse.Namespace) -> list[Row]:
-    """Held-out rays: a stream in three orders against all scans at once, as many clusters."""
+    """Held-out rays: streams in three orders, and all scans at once with as many clusters."""
     rows = []
     for name in tqdm(arguments.sets, "accuracy", disable=None):
         rays = protocol_rays(load_scans(arguments.data / name / "scans.npz"), 120_000)
@@ -110,7 +110,7 @@ def accuracy(arguments: argparse.Namespace) -> list[Row]:
 
 
 def revisits(arguments: argparse.Namespace) -> list[Row]:
-    """Clusters as one place is seen again with other rays and another seed, eleven times."""
+    """Number of clusters after each of eleven visits of one place with other rays and seeds."""
     rows = []
     for name in tqdm(arguments.sets, "revisits", disable=None):
         scans = protocol_rays(load_scans(arguments.data / name / "scans.npz"))
@@ -142,7 +142,7 @@ def seconds_of(run: Callable[[], Any]) -> float:
 def learn_job(
     model: LardHilbertMap, scans: list[Scans], config: StreamConfig
 ) -> Callable[[int], Any]:
-    """Learn scan ``turn`` of a stream that starts over when it ends."""
+    """Update the map with scan ``turn`` of a stream that repeats."""
     return lambda turn: stream_scans(
         model,
         [scans[turn % len(scans)]],
@@ -157,9 +157,9 @@ def octomap_job(scans: list[Scans]) -> Callable[[int], Any]:
 
 
 def speed(arguments: argparse.Namespace) -> list[Row]:
-    """Rays in memory to learned: the map, its real-time setting and OctoMap at 0.1 m, in turn."""
-    # A process for each set: the tree of the one before would leave the heap in pieces, in which
-    # room for every large tensor is searched for.
+    """Time from rays in memory to an updated map: default, real time, OctoMap at 0.1 m."""
+    # One process per set: OctoMap's tree of the previous set would fragment the heap, which slows
+    # down large allocations.
     jobs = [(arguments.data, name) for name in ("kitti00_mulls", "sevenscenes_rgbd")]
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=fresh, max_tasks_per_child=1) as process:
@@ -170,7 +170,7 @@ def speed(arguments: argparse.Namespace) -> list[Row]:
 
 @torch.no_grad()
 def speed_of(data: Path, name: str) -> list[Row]:
-    """Times of one set's scans, system by system."""
+    """Times of the scans of one set, per system."""
     rays = protocol_rays(load_scans(data / name / "scans.npz"))
     train, test = split_rays(rays, 0.98)
     scans = single_scans(train)
@@ -202,7 +202,7 @@ def speed_of(data: Path, name: str) -> list[Row]:
 
 
 def growth(arguments: argparse.Namespace) -> list[Row]:
-    """Scans of a straight drive, each learned again and again, in turn."""
+    """Time per scan along a straight drive; several scans are timed alternately."""
     rows: list[Row] = []
     for meters, radius in ((1.0, None), (1.0, 60.0), (4.0, None)):
         model, kept = LardHilbertMap(), {}
@@ -243,7 +243,7 @@ def seconds_again(
 
 
 def fading(arguments: argparse.Namespace) -> list[Row]:
-    """A box of 1 m stands for some scans, then it is gone: scans until its place is free."""
+    """A box of 1 m is seen for some scans and then removed: scans until its place is free."""
     lower = torch.tensor([10.0, -1.0, 0.2], dtype=torch.float64)
     box = (lower, lower + 1.0)
     rows = []
@@ -272,7 +272,7 @@ def fading(arguments: argparse.Namespace) -> list[Row]:
 
 
 def spacing(arguments: argparse.Namespace) -> list[Row]:
-    """A street of 80 m, scans so far apart: held-out rays at three places after the drive."""
+    """Held-out rays at three places of a street of 80 m, for several distances between scans."""
     rows = []
     places = [street_scan(x, 8_000, 90_000 + int(x)) for x in (30.3, 40.1, 50.7)]
     tests = [protocol_rays(scan) for scan in places]
@@ -300,7 +300,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--sets", nargs="+", default=list(SETS))
     parser.add_argument("--only", nargs="+", choices=[part.__name__ for part in PARTS])
-    parser.add_argument("--seed", type=int, default=0, help="of the split in accuracy")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="random seed of the split of the accuracy part (default: 0)",
+    )
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "incremental.json")
     arguments = parser.parse_args()
     missing = [name for name in arguments.sets if not (arguments.data / name).is_dir()]

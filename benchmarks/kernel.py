@@ -1,4 +1,4 @@
-"""Time of the native kernel alone: ns a point and thread by order of the points and size of the map.
+"""Time of the native kernel alone: ns per point and thread, by point order and map size.
 
     python benchmarks/kernel.py [--threads 1] [--repeats 7]
 
@@ -31,7 +31,7 @@ ROOM = (6.0, 5.0, 2.0)  # [m]
 
 
 def seconds(run: Callable[[], Any], repeats: int) -> float:
-    """Median of so many runs, after one to warm up."""
+    """Median time of so many runs after a warm-up run."""
     run()
     times = []
     for _ in range(repeats):
@@ -65,7 +65,7 @@ def lattice(low: Tensor, high: Tensor, shape: tuple[int, ...] = (127, 107, 47)) 
 
 
 def measure(points: Tensor, centers: Tensor, repeats: int, threads: int) -> dict[str, Any]:
-    """Times a point and thread [ns] of one map: query in lattice and random order, training step."""
+    """Time per point and thread [ns]: query in lattice and random order, training step."""
     ops = torch.ops.lardhm
     count = len(centers)
     spacing = (float(np.prod(ROOM)) / count) ** (1 / 3)
@@ -97,7 +97,7 @@ def measure(points: Tensor, centers: Tensor, repeats: int, threads: int) -> dict
 
 
 def floor_note(points: Tensor, threads: int, repeats: int) -> str:
-    """The floor: one pass over the points that writes one number each."""
+    """Lower bound: one pass over the points that writes one number per point."""
     out = torch.empty(len(points))
     each = 1e9 * seconds(lambda: torch.sum(points, dim=1, out=out), repeats) * threads / len(points)
     return f"floor: {each:.1f} ns a point and thread to read a point and write a number"

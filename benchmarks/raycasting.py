@@ -1,4 +1,4 @@
-"""Rays against maps: how far ranges are off on held-out rays, and how fast they come.
+"""Ray casting: range errors on held-out rays, and time.
 
 Usage: python benchmarks/raycasting.py [--data DATA] [--only error speed]
 
@@ -36,11 +36,11 @@ SETS = (
 STREET = "kitti00_mulls"
 MAX_RANGE = 80.0  # [m]
 VOXELS = (0.05, 0.1, 0.2, 0.4)  # [m]
-COUNT = 10_000  # rays that OctoMap's loop is asked for
+COUNT = 10_000  # rays of the loop over OctoMap
 
 
 def fitted(data: Path, name: str):
-    """The map of half of the rays, both halves."""
+    """A map fitted to half of the rays, and both halves."""
     rays = protocol_rays(load_scans(data / name / "scans.npz"), 120_000)
     train, test = split_rays(rays, 0.5, 0)
     samples = sample_rays(train)
@@ -48,7 +48,7 @@ def fitted(data: Path, name: str):
 
 
 def errors(data: Path) -> None:
-    """Median error [m] and share of rays that meet anything, for all sets."""
+    """Median error [m] and fraction of rays that hit, for all sets."""
     print(f"{'set':<24}{'ridge':>8}{'met':>7}{'crossing':>10}{'expected':>10}   median error [m]")
     for name in SETS:
         model, _, test = fitted(data, name)
@@ -66,7 +66,7 @@ def errors(data: Path) -> None:
 
 
 def speed(data: Path) -> None:
-    """Time of 10^6 rays, and of OctoMap's loop, with the error of both on held-out rays."""
+    """Time of 10^6 rays and of a loop over OctoMap, with both errors on held-out rays."""
     model, train, test = fitted(data, STREET)
     rng = torch.Generator().manual_seed(0)
     pick = torch.randint(len(test), (1_000_000,), generator=rng)
@@ -105,7 +105,7 @@ def octomap_ranges(baseline: OctoMapBaseline, origins: Tensor, ways: Tensor) -> 
 
 
 def median_error(ranges: Tensor, truth: Tensor) -> float:
-    """Of the rays that met anything [m]."""
+    """Median error of the rays that hit [m]."""
     met = ranges.isfinite()
     return float((ranges - truth)[met].abs().median())
 
@@ -120,7 +120,7 @@ def print_speed(name: str, seconds: float, ours: float, ranges: Tensor, off: flo
 
 
 def main() -> None:
-    """Both parts."""
+    """Run both parts."""
     parser = argparse.ArgumentParser(description="Ranges of held-out rays, and their speed.")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--only", nargs="+", choices=("error", "speed"), default=("error", "speed"))

@@ -1,4 +1,4 @@
-"""Scenes of any size, to see how time grows with clusters and points."""
+"""Synthetic scenes of any size, for the growth with clusters and points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def labelled_hills(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def made_up_map(num_clusters: int, num_neighbors: int = 5, seed: int = 0) -> LardHilbertMap:
-    """A map of so many clusters on the hills, half of them free, loaded instead of trained."""
+    """A map of so many clusters on hills, half of them free, built without training."""
     rng = torch.Generator().manual_seed(seed)
     centers = hills(AREA_PER_CLUSTER * num_clusters / 2, num_clusters, rng)
     is_occupied = torch.arange(num_clusters) % 2 > 0

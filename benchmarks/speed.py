@@ -1,11 +1,11 @@
-"""Time and memory: the paper's tables against the others, growth, and the machine's floor.
+"""Time and memory: the tasks of the paper, growth, and the lower bound of the machine.
 
-Each comparison is one function and can run alone:
+Each comparison is one function and can be run alone:
 
     python benchmarks/speed.py --only query train
 
-Contenders run in turn after a warm-up; medians and ratios are printed, all runs on the threads of
-``--threads``. Keep the machine quiet.
+After a warm-up the systems are timed alternately; medians and ratios are printed. All use the number
+of threads given by ``--threads``. The machine should be idle.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from conditions import ROOT, conditions, describe, write_json
+from default_query import default_query
 from growth import floor, growth_clusters, growth_points, growth_scans, memory
 from table_two import (
     NUM_CLUSTERS,
@@ -57,7 +58,7 @@ Result = dict[str, Any]
 
 
 def plain_jobs(data: Path) -> dict[str, Callable[[], Any]]:
-    """What the process without the native kernel can be asked to do."""
+    """Jobs for the process without the native kernel."""
     task = load_task(data)
     model = fit_map(task)
     return {
@@ -101,7 +102,7 @@ def query(arguments: argparse.Namespace) -> Result:
 
 
 def train(arguments: argparse.Namespace) -> Result:
-    """Points (or rays) in memory to a map that can be asked, clustering included."""
+    """Points (or rays) in memory to a fitted map, clustering included."""
     task = load_task(arguments.data)
     schedule = sgd_schedule(len(task.points))
     rays = scan_arrays(task.scans)
@@ -123,13 +124,13 @@ def train(arguments: argparse.Namespace) -> Result:
 
 
 def sgd_schedule(num_points: int) -> tuple[int, int]:
-    """Passes and batch size of our defaults, for the contender that trains in plain torch."""
+    """Passes and batch size of the defaults, for the system that trains in plain torch."""
     config = FitConfig()
     return config.passes, config.batch_size or max(256, num_points // 128)
 
 
 def paper_note(kind: str) -> str:
-    """The paper's own figures, for a look across machines and years."""
+    """The figures of the paper, from another machine."""
     figures = ", ".join(f"{name} {ms:,} ms" for name, ms in PAPER_TOTALS[kind].items())
     return f"paper, Table II (8 cores of 2.5 GHz, 2016): {figures}"
 
@@ -138,7 +139,7 @@ def paper_note(kind: str) -> str:
 
 
 def stages(arguments: argparse.Namespace) -> Result:
-    """The steps of Table I one by one, ours and the paper's."""
+    """The steps of Table I separately, beside the times of the paper."""
     task = load_task(arguments.data)
     model = fit_map(task)
     rows = []
@@ -218,6 +219,7 @@ def kmeans(arguments: argparse.Namespace) -> Result:
 
 PARTS: dict[str, Callable[[argparse.Namespace], Result]] = {
     "query": query,
+    "default_query": default_query,
     "train": train,
     "stages": stages,
     "kmeans": kmeans,
@@ -235,7 +237,18 @@ def parse_arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--max-points", type=int, default=10**6, help="of growth_points")
+    parser.add_argument(
+        "--rays",
+        type=int,
+        default=120_000,
+        help="most rays per set of default_query (default: 120000)",
+    )
+    parser.add_argument(
+        "--max-points",
+        type=int,
+        default=10**6,
+        help="most points of growth_points (default: 1000000)",
+    )
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "speed.json")
     return parser.parse_args(argv)
 

@@ -1,4 +1,4 @@
-"""The paper's Table II task, and the others that do it: OctoMap, and plain Python libraries.
+"""The task of Table II of the paper for this package, OctoMap and plain Python libraries.
 
 82,842 training points (one hit and one free point of each of 41,421 rays), 500 clusters, 5
 neighbors, a grid of 638,683 query points.
@@ -50,7 +50,7 @@ def load_task(folder: Path) -> Task:
 
 
 def fit_map(task: Task) -> LardHilbertMap:
-    """Ours, through the public door: points in memory to trained map."""
+    """Fit a map with the public interface: points in memory to a fitted map."""
     model = LardHilbertMap(dim=3, num_neighbors=NUM_NEIGHBORS)
     return model.fit(task.points, task.labels, num_clusters=NUM_CLUSTERS, seed=0)
 
@@ -59,7 +59,7 @@ def fit_map(task: Task) -> LardHilbertMap:
 
 
 def load_octomap(name: str) -> Any | None:
-    """The module of octomap-python or of pyoctomap; None where it is not installed."""
+    """The module of octomap-python or pyoctomap; None if it is not installed."""
     import importlib
 
     try:
@@ -77,7 +77,7 @@ def scan_arrays(scans: Scans) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def insert(library: Any, rays: list[tuple[np.ndarray, np.ndarray]], discretize: bool) -> Any:
-    """A tree of the rays; ``discretize`` keeps one ray a voxel, OctoMap's own short cut."""
+    """Insert the rays into a tree; ``discretize`` keeps one ray per voxel, an option of OctoMap."""
     tree = library.OcTree(RESOLUTION)
     for ends, origin in rays:
         tree.insertPointCloud(ends, origin, discretize=discretize)
@@ -88,7 +88,7 @@ def insert(library: Any, rays: list[tuple[np.ndarray, np.ndarray]], discretize: 
 
 
 class PlainLibraries:
-    """LARD Hilbert Map of scikit-learn's k-means, SciPy's k-d tree and a torch SGD loop.
+    """LARD Hilbert Map from scikit-learn's k-means, SciPy's k-d tree and an SGD loop in torch.
 
     Passes and batches of the SGD are those of ours, so that the same work is timed.
     """

@@ -1,4 +1,4 @@
-"""What tiles lose: held-out rays asked of a single map and of a tiled one, fitted to the same rays.
+"""Accuracy that tiles lose: a single map and a tiled map of the same rays, on held-out rays.
 
 The protocol is that of `accuracy.py`, with half of the rays training; the folders of tiles are made
 and fitted as `lardhm tile` and `lardhm fit-tiles` do it. Exit code 1 if tiles lose more than
@@ -29,7 +29,7 @@ RATIO = 0.5  # of the rays trains
 
 
 class Row(NamedTuple):
-    """A line of the table: a set, how it is cut up, and which of its rays."""
+    """A row of the table: a set, its tiling, and which of its rays."""
 
     name: str
     edge: float  # [m] of a tile
@@ -47,14 +47,14 @@ ROWS = (
 
 
 def tiled_map(train: Scans, row: Row, folder: Path) -> TiledMap:
-    """The rays to the points of tiles, those to maps."""
+    """Tile the rays and fit the tiles."""
     tile_scans([train], folder, TilingConfig(edge=row.edge, halo=row.halo, seed=row.seed))
     fit_tiles(folder)
     return TiledMap.open(folder)
 
 
 def run_row(row: Row, scans: Scans) -> dict[str, Scores | int]:
-    """Scores of both, and how many clusters and tiles they have."""
+    """Scores of both maps, and their numbers of clusters and tiles."""
     train, test = split_rays(protocol_rays(scans, row.rays, row.seed), RATIO, row.seed)
     single = lard_hilbert_map(train, row.seed)
     with tempfile.TemporaryDirectory() as folder:
@@ -74,18 +74,18 @@ def accuracies(scores: Scores) -> list[float]:
 
 
 def changes(result: dict[str, Scores | int]) -> list[float]:
-    """What tiles gain of both accuracies."""
+    """Accuracy that tiles gain (or lose, if negative)."""
     pairs = zip(accuracies(result["one map"]), accuracies(result["tiles"]), strict=True)
     return [tiles - single for single, tiles in pairs]
 
 
 def format_pair(values: list[float], style: str = ".4f") -> str:
-    """Figures below 1 of the two kinds, without their zeros before the point."""
+    """Format two figures below 1 without leading zeros."""
     return " / ".join(format(value, style).replace("0.", ".") for value in values)
 
 
 def format_row(row: Row, result: dict[str, Scores | int]) -> str:
-    """A line of the table, in Markdown."""
+    """A row of the table, in Markdown."""
     rays = "all" if row.rays is None else f"{row.rays:,}"
     halo = f", halo {row.halo:g} m" if row.halo else ""
     cells = [

@@ -1,4 +1,4 @@
-"""Questions to a map of many tiles: rate and memory against one map in memory.
+"""Queries of a map of many tiles: rate and memory, compared with one map in memory.
 
     python benchmarks/tiles.py            # a map of 1000 tiles, 10^7 points
 
@@ -30,7 +30,7 @@ CLUSTERS = 1000  # a tile: 20 m of KITTI street take about 800
 
 
 def city(num_tiles: int, seed: int = 0) -> LardHilbertMap:
-    """A flat world of tiles, clusters as large and as dense as those of a street, 4 m high."""
+    """A flat world of tiles, 4 m high, with clusters as large and dense as those of a street."""
     rng = torch.Generator().manual_seed(seed)
     count = num_tiles * CLUSTERS
     tile = torch.arange(count) // CLUSTERS
@@ -67,7 +67,7 @@ def questions(num_points: int, num_tiles: int, order: str, seed: int = 1) -> tor
 
 
 def peak_megabytes() -> float:
-    """Largest resident set of this process so far (not of the one that started it)."""
+    """Peak resident memory of this process (not of its parent)."""
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
@@ -80,7 +80,7 @@ def seconds(ask: object, points: torch.Tensor) -> tuple[float, torch.Tensor]:
 
 
 def measure(arguments: argparse.Namespace) -> None:
-    """One setting: seconds and memory as JSON."""
+    """Measure one setting and print time and memory as JSON."""
     points = questions(arguments.points, arguments.tiles, arguments.order)
     folder, row = Path(arguments.folder), {"points_mb": points.nbytes / 2**20}
     start = time.perf_counter()
@@ -100,13 +100,13 @@ def measure(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Make the map once, then measure each setting in turn."""
+    """Build the map once, then measure each setting."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tiles", type=int, default=1000)
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--limit", type=int, default=384, help="memory limit of the map [MiB]")
     parser.add_argument("--repeats", type=int, default=1)
-    parser.add_argument("--folder", help="where the map is, or will be, kept")
+    parser.add_argument("--folder", help="folder of the map; it is created if it does not exist")
     parser.add_argument("--orders", nargs="*", default=("grouped", "random"))
     parser.add_argument("--order", choices=("grouped", "random"), default="grouped")
     parser.add_argument("--measure", choices=("single", "tiled"))

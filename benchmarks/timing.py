@@ -1,4 +1,4 @@
-"""Contenders timed in turn, and the table of what they took."""
+"""Time several systems alternately, and format the results as a table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAUSE = 0.02  # [s] before each run: threads of the run before may still be spin
 
 
 class Contender(NamedTuple):
-    """One way to do a job: a name, and a call that does it once."""
+    """A system to be timed: its name, and a call that runs it once."""
 
     name: str
     run: Callable[[], Any]
@@ -20,7 +20,7 @@ class Contender(NamedTuple):
 def compare(
     title: str, contenders: Sequence[Contender], repeats: int, items: int, item: str = "point"
 ) -> dict[str, Any]:
-    """Warm all up, then run them in turn (A B A B); the first one is what the others are held to.
+    """Warm up all systems, then time them alternately (A B A B); ratios are relative to the first.
 
     Args:
         title: head of the table.
@@ -44,7 +44,7 @@ def compare(
 
 
 def summary(runs: list[float], ours: float, items: int) -> dict[str, float]:
-    """Ratio of medians, median, fastest and slowest run [ms], and the median an item [ns]."""
+    """Ratio of medians, median, fastest and slowest run [ms], and median per item [ns]."""
     median = statistics.median(runs)
     return {
         "ratio": median / ours,
@@ -69,7 +69,7 @@ def format_comparison(result: dict[str, Any]) -> str:
 
 
 def format_rows(result: dict[str, Any]) -> str:
-    """Text table of figures that are not a comparison: one dictionary a row."""
+    """Text table of figures that are not a comparison, one dictionary per row."""
     columns = list(result["rows"][0])
     cells = [columns, *([_format(row[name]) for name in columns] for row in result["rows"])]
     widths = [max(len(line[place]) for line in cells) + 2 for place in range(len(columns))]

@@ -1,4 +1,4 @@
-"""How many pictures a second the viewer's page draws, in a Chromium without a graphics card.
+"""Frames per second of the viewer in Chromium with software rendering.
 
 Usage: python benchmarks/viewing.py [--data DATA] [--set balm_realworld] [--picture PICTURE]
 
@@ -30,7 +30,7 @@ COUNT = """() => { window.frames_drawn = 0;
 
 
 def processor_seconds() -> float:
-    """Time that the browser has taken from the processors so far (Linux)."""
+    """Processor time that the browser has used so far (Linux)."""
     ticks, parents, names = {}, {}, {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
@@ -63,12 +63,14 @@ def turned(page: Page) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    """Open the page, turn it with all shown, with the points alone, with the surface alone."""
+    """Open the viewer and rotate it with everything, only the points, and only the surface."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--set", default="balm_realworld")
     parser.add_argument("--most-points", type=int, default=ViewConfig().max_points)
-    parser.add_argument("--picture", type=Path, help="screenshots are written beside it")
+    parser.add_argument(
+        "--picture", type=Path, help="file to write; screenshots are written beside it"
+    )
     arguments = parser.parse_args()
     print(describe(conditions()))
     scans = load_scans(arguments.data / arguments.set / "scans.npz")

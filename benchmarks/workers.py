@@ -1,4 +1,4 @@
-"""Other processes: one that answers on the plain torch path, and fresh ones to measure memory."""
+"""Other processes: one that uses plain torch, and new ones to measure memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SPAWN = multiprocessing.get_context("spawn")
 
 @contextmanager
 def plain_path(jobs: Callable[..., dict[str, Callable[[], Any]]], *arguments: Any) -> Iterator[Any]:
-    """A process in which the native kernel is off; gives a call that runs one of the jobs there.
+    """Start a process without the native kernel; yields a call that runs one of the jobs there.
 
     Args:
         jobs: a function of a module that makes the jobs in the new process, by name.
@@ -63,7 +63,7 @@ def _serve(
 
 
 def peak_memory(job: Callable[..., Callable[[], Any]], *arguments: Any) -> int:
-    """Bytes that a job needs at its peak on top of its prepared input, in a fresh process.
+    """Peak memory of a job beyond its prepared input [bytes], in a new process.
 
     Args:
         job: a function of a module; it prepares the input and returns the call that is measured.
@@ -89,7 +89,7 @@ def _measure(
 ) -> None:
     torch.set_num_threads(threads)
     run = job(*arguments)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew at what is held now
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak to the current memory
     before = _status_bytes("VmRSS")
     run()
     connection.send(_status_bytes("VmHWM") - before)

@@ -1,6 +1,8 @@
-"""How Sphinx builds the documentation: `make docs`."""
+"""Sphinx configuration; `make docs` builds the documentation."""
 
 import argparse
+import dataclasses
+import inspect
 import re
 from pathlib import Path
 
@@ -9,6 +11,10 @@ import tomllib
 from lardhm_torch import cli
 
 HERE = Path(__file__).parent
+EXIT_CODES = (
+    "Exit code: 0 on success; 1 after an error, which is reported in one line; "
+    "2 for an invalid command line."
+)
 project = "lardhm_torch"
 author = "The lardhm_torch developers"
 release = tomllib.loads((HERE.parent / "pyproject.toml").read_text())["project"]["version"]
@@ -27,19 +33,31 @@ napoleon_google_docstring = True
 autodoc_mock_imports: list[str] = []
 
 
+FIELD = re.compile(r"^    (\w+): .* = .+?  # (.+)$", re.MULTILINE)
+
+
+def add_settings(obj, lines):
+    """Append the fields of a settings class, which comments in its source describe."""
+    fields = FIELD.findall(inspect.getsource(obj))
+    if fields:
+        lines += ["", *(f"- ``{name}``: {text}" for name, text in fields), ""]
+
+
 def plain_text(app, what, name, obj, options, lines):
-    """Docstrings are plain text with formulas: |x| and k_ are not reStructuredText."""
+    """Escape characters such as |x| and k_: docstrings are plain text, not reStructuredText."""
+    if what == "class" and dataclasses.is_dataclass(obj):
+        add_settings(obj, lines)
     for number, line in enumerate(lines):
         line = line.replace("|", "\\|").replace("*", "\\*")
         lines[number] = re.sub(r"(?<=\w)_(?=[\s,.;:)]|$)", r"\\_", line)
 
 
 def write_command_line(app) -> None:
-    """The page of the command line, from the parser itself."""
+    """Write the page of the command line from the help texts of the parser."""
     parser = cli.make_parser()
     verbs = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     page = ["# Command line", "", parser.description or "", "", parser.epilog or "", ""]
-    page += ["Exit code 0, or a one-line error and 1; 2 for a wrong command line.", ""]
+    page += [EXIT_CODES, ""]
     for name, verb in verbs.choices.items():
         verb.formatter_class = lambda prog: argparse.HelpFormatter(prog, width=88)
         page += [f"## lardhm {name}", "", "```text", verb.format_help().rstrip(), "```", ""]
@@ -50,6 +68,6 @@ def write_command_line(app) -> None:
 
 
 def setup(app) -> None:
-    """Hooks of this build."""
+    """Connect the functions above to the build."""
     app.connect("autodoc-process-docstring", plain_text, priority=1000)
     app.connect("builder-inited", write_command_line)

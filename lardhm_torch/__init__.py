@@ -1,87 +1,91 @@
-"""LARD Hilbert Maps in PyTorch: continuous, probabilistic maps of occupancy from range scans."""
+"""LARD Hilbert Maps in PyTorch: continuous, probabilistic occupancy maps from range scans."""
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from lardhm_torch.hilbert_map import LardHilbertMap
-    from lardhm_torch.io.scan_files import iter_scans, load_scans, save_scans
-    from lardhm_torch.learning.fine_tuning import TuneConfig, fine_tune
-    from lardhm_torch.learning.fitting import FitConfig
-    from lardhm_torch.learning.map_merging import merge_maps
-    from lardhm_torch.learning.parameters import resize_optimizer
-    from lardhm_torch.learning.update import UpdateConfig
-    from lardhm_torch.queries.grids import grid
-    from lardhm_torch.queries.raycasting import raycast
-    from lardhm_torch.sampling import Samples, SamplingConfig, sample_rays
-    from lardhm_torch.scans import Scans, split_rays
-    from lardhm_torch.simulation import simulate_room
-    from lardhm_torch.streaming import StreamConfig, resume_stream, stream_scans
-    from lardhm_torch.surfaces.meshing import extract_mesh
-    from lardhm_torch.tiles.tiled_map import TiledMap
+if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the table below
+    from lardhm_torch.evaluation.held_out import evaluate as evaluate
+    from lardhm_torch.hilbert_map import LardHilbertMap as LardHilbertMap
+    from lardhm_torch.io.grid_files import save_grid as save_grid
+    from lardhm_torch.io.mesh_files import save_mesh as save_mesh
+    from lardhm_torch.io.scan_files import iter_scans as iter_scans
+    from lardhm_torch.io.scan_files import load_points as load_points
+    from lardhm_torch.io.scan_files import load_scans as load_scans
+    from lardhm_torch.io.scan_files import save_scans as save_scans
+    from lardhm_torch.learning.fine_tuning import TuneConfig as TuneConfig
+    from lardhm_torch.learning.fine_tuning import fine_tune as fine_tune
+    from lardhm_torch.learning.fitting import FitConfig as FitConfig
+    from lardhm_torch.learning.map_merging import merge_maps as merge_maps
+    from lardhm_torch.learning.parameters import resize_optimizer as resize_optimizer
+    from lardhm_torch.learning.update import UpdateConfig as UpdateConfig
+    from lardhm_torch.queries.collision import Mover as Mover
+    from lardhm_torch.queries.collision import clearance as clearance
+    from lardhm_torch.queries.collision import expected_range as expected_range
+    from lardhm_torch.queries.collision import free_probability as free_probability
+    from lardhm_torch.queries.collision import segment_hazard as segment_hazard
+    from lardhm_torch.queries.exploration import frontiers as frontiers
+    from lardhm_torch.queries.exploration import information_gain as information_gain
+    from lardhm_torch.queries.grids import grid as grid
+    from lardhm_torch.queries.grids import query_grid as query_grid
+    from lardhm_torch.queries.grids import query_slice as query_slice
+    from lardhm_torch.queries.raycasting import raycast as raycast
+    from lardhm_torch.sampling import Samples as Samples
+    from lardhm_torch.sampling import SamplingConfig as SamplingConfig
+    from lardhm_torch.sampling import sample_rays as sample_rays
+    from lardhm_torch.scans import Scans as Scans
+    from lardhm_torch.scans import split_rays as split_rays
+    from lardhm_torch.simulation import simulate_room as simulate_room
+    from lardhm_torch.streaming import StreamConfig as StreamConfig
+    from lardhm_torch.streaming import real_time as real_time
+    from lardhm_torch.streaming import resume_stream as resume_stream
+    from lardhm_torch.streaming import stream_scans as stream_scans
+    from lardhm_torch.surfaces.meshing import extract_mesh as extract_mesh
+    from lardhm_torch.tiles.tiled_map import TiledMap as TiledMap
+    from lardhm_torch.viewing.viewer import MapViewer as MapViewer
 
-_ROOM_OF = {
-    "FitConfig": "learning.fitting",
-    "LardHilbertMap": "hilbert_map",
-    "Samples": "sampling",
-    "SamplingConfig": "sampling",
-    "Scans": "scans",
-    "StreamConfig": "streaming",
-    "TiledMap": "tiles.tiled_map",
-    "TuneConfig": "learning.fine_tuning",
-    "UpdateConfig": "learning.update",
-    "extract_mesh": "surfaces.meshing",
-    "fine_tune": "learning.fine_tuning",
-    "grid": "queries.grids",
-    "iter_scans": "io.scan_files",
-    "load_scans": "io.scan_files",
-    "merge_maps": "learning.map_merging",
-    "raycast": "queries.raycasting",
-    "resize_optimizer": "learning.parameters",
-    "resume_stream": "streaming",
-    "sample_rays": "sampling",
-    "save_scans": "io.scan_files",
-    "simulate_room": "simulation",
-    "split_rays": "scans",
-    "stream_scans": "streaming",
+_NAMES = {
+    "evaluation.held_out": ["evaluate"],
+    "hilbert_map": ["LardHilbertMap"],
+    "io.grid_files": ["save_grid"],
+    "io.mesh_files": ["save_mesh"],
+    "io.scan_files": ["iter_scans", "load_points", "load_scans", "save_scans"],
+    "learning.fine_tuning": ["TuneConfig", "fine_tune"],
+    "learning.fitting": ["FitConfig"],
+    "learning.map_merging": ["merge_maps"],
+    "learning.parameters": ["resize_optimizer"],
+    "learning.update": ["UpdateConfig"],
+    "queries.collision": [
+        "Mover",
+        "clearance",
+        "expected_range",
+        "free_probability",
+        "segment_hazard",
+    ],
+    "queries.exploration": ["frontiers", "information_gain"],
+    "queries.grids": ["grid", "query_grid", "query_slice"],
+    "queries.raycasting": ["raycast"],
+    "sampling": ["Samples", "SamplingConfig", "sample_rays"],
+    "scans": ["Scans", "split_rays"],
+    "simulation": ["simulate_room"],
+    "streaming": ["StreamConfig", "real_time", "resume_stream", "stream_scans"],
+    "surfaces.meshing": ["extract_mesh"],
+    "tiles.tiled_map": ["TiledMap"],
+    "viewing.viewer": ["MapViewer"],
 }
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
-__all__ = [
-    "FitConfig",
-    "LardHilbertMap",
-    "Samples",
-    "SamplingConfig",
-    "Scans",
-    "StreamConfig",
-    "TiledMap",
-    "TuneConfig",
-    "UpdateConfig",
-    "extract_mesh",
-    "fine_tune",
-    "grid",
-    "iter_scans",
-    "load_scans",
-    "merge_maps",
-    "raycast",
-    "resize_optimizer",
-    "resume_stream",
-    "sample_rays",
-    "save_scans",
-    "simulate_room",
-    "split_rays",
-    "stream_scans",
-]
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used, so that `import lardhm_torch` is instant."""
-    if name not in _ROOM_OF:
+    """Import a public name on first use, which keeps `import lardhm_torch` fast."""
+    if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
+    return getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    """Public names, for tab completion."""
+    """Return the public names, for tab completion."""
     return __all__

@@ -110,6 +110,9 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
         config: spacings and limits; the defaults serve all scenes.
         seed: of the random positions; the same seed gives the same samples.
 
+    Returns:
+        Labelled points, the hits first.
+
     Raises:
         NoUsableRayError: no ray is usable; a ValueError whose message says why.
 

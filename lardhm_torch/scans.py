@@ -143,7 +143,15 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
 
 
 def split_rays(scans: Scans, ratio: float = 0.5, seed: int = 0) -> tuple[Scans, Scans]:
-    """Two sets of whole rays: a random share ``ratio`` and the rest.
+    """Split rays at random into two sets.
+
+    Args:
+        scans: range scans.
+        ratio: fraction of the rays in the first set.
+        seed: random seed of the split.
+
+    Returns:
+        The first set, and the rest.
 
     Raises:
         ValueError: ratio is not strictly between 0 and 1.

@@ -46,10 +46,16 @@ class StreamConfig:
 
 
 def real_time(config: StreamConfig | None = None) -> StreamConfig:
-    """The same with about half of the work: all rays, but fewer free points, clusters and recalls.
+    """Settings for real-time updates: all rays, with fewer free points, clusters and pseudo-samples.
 
-    For a full 64-beam scan ten times a second on two cores; benchmarks/incremental.py measures what
-    it costs in accuracy.
+    An update takes about half the time: ten full 64-beam scans per second on two cores.
+    benchmarks/incremental.py measures the accuracy.
+
+    Args:
+        config: settings to start from; None: the defaults.
+
+    Returns:
+        New settings; ``config`` is unchanged.
     """
     config = config or StreamConfig()
     fit = replace(config.update.fit, batch_size=2048)
@@ -133,7 +139,13 @@ def stream_scans(
 def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progress]:
     """The map of a checkpoint and how much of the stream is in it.
 
-    Incomplete temporary files that a killed run left beside the checkpoint are removed.
+    Partial files that an interrupted run left beside the checkpoint are removed.
+
+    Args:
+        path: checkpoint that `stream_scans` wrote.
+
+    Returns:
+        The map, and how many scans and rays are in it.
 
     Raises:
         FileNotFoundError: there is no such file.

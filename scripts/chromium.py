@@ -1,4 +1,4 @@
-"""The Chromium that opens the viewer's page for its picture, its benchmark and its tests."""
+"""Start Chromium for the screenshot, the benchmark and the tests of the viewer."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-)  # no window, no graphics card, nothing from the network
+)  # headless, software rendering, no network
 
 
 def chromium_path() -> str | None:
-    """Where Chromium is installed; None if it is not."""
+    """Path of Chromium; None if it is not installed."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A browser without a window that draws with the processor, with a fresh temporary profile.
+    """Headless browser with software rendering and a new temporary profile.
 
     Raises:
         RuntimeError: no Chromium is installed.

@@ -1,4 +1,4 @@
-"""The main job from end to end: simulate a room, fit a map, evaluate it, mesh it, draw it.
+"""Demo: simulate a room, fit a map, evaluate it, extract its mesh and draw it.
 
 Usage: python scripts/demo.py [FOLDER]    (default: out)
 """
@@ -10,16 +10,16 @@ import torch
 
 from lardhm_torch import (
     LardHilbertMap,
+    evaluate,
     extract_mesh,
     sample_rays,
+    save_mesh,
     save_scans,
     simulate_room,
     split_rays,
 )
-from lardhm_torch.evaluation.held_out import evaluate
 from lardhm_torch.evaluation.mesh_distances import mesh_metrics
 from lardhm_torch.evaluation.scores import format_metrics
-from lardhm_torch.io.mesh_files import save_mesh
 from lardhm_torch.simulation import room_mesh
 from lardhm_torch.viewing.rendering import render_mesh, render_slice
 

@@ -1,7 +1,7 @@
-"""The pictures of the README: fit a map to real scans, mesh it, draw it.
+"""Draw the pictures of docs/accuracy.md: fit maps to real scans and draw their meshes.
 
 Usage: python scripts/draw_maps.py DATA [-o docs/pictures]
-DATA is the folder that holds one folder for each set, with its `scans.npz`.
+DATA is a folder with one folder per set, which contains `scans.npz`.
 """
 
 import argparse
@@ -21,7 +21,7 @@ RESOLUTION = {"sevenscenes_rgbd": 0.03, "riegl_vz400i_rtls": 0.06, "balm_realwor
 
 
 def main() -> None:
-    """One picture for each set."""
+    """Draw one picture per set."""
     parser = argparse.ArgumentParser(description="Draw the maps of real scans.")
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/pictures"))

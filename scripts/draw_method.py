@@ -1,4 +1,4 @@
-"""The method in four pictures, in two dimensions: points, clusters, one and eight neighbors.
+"""Draw the method in two dimensions: points, clusters, and maps with one and eight neighbors.
 
 Usage: python scripts/draw_method.py [PICTURE]    (default: docs/pictures/method.png)
 """
@@ -21,7 +21,7 @@ BOX, PILLAR = (3.0, 2.0), (1.2, 0.3, 0.6)  # [m] half edges of the room; x, y, r
 
 
 def simulate(origin: tuple[float, float], count: int = 400) -> Scans:
-    """A laser that turns in a box with a round pillar."""
+    """Scan of a rotating laser in a box with a round pillar."""
     angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
     way = torch.stack([angle.cos(), angle.sin()], dim=1)
     start = torch.tensor(origin, dtype=torch.float64)
@@ -51,7 +51,7 @@ def draw_clusters(axes: Any, model: LardHilbertMap) -> None:
 
 
 def main(picture: Path) -> None:
-    """Fit twice, draw."""
+    """Fit two maps and draw the four pictures."""
     parts = [sample_rays(simulate(origin), seed=1) for origin in ((-1.5, 0.5), (0.5, -1.2))]
     points = torch.cat([part.points for part in parts])
     labels: Tensor = torch.cat([part.labels for part in parts])

@@ -1,4 +1,4 @@
-"""Tune the length-scales of a saved map on new scans; centers and weights stay as they are.
+"""Fine-tune the length scales of a saved map on new scans; centers and weights are kept.
 
 Usage: python scripts/finetune.py map.pt SCANS -o tuned.pt [--epochs 12]
 """

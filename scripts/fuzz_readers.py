@@ -1,9 +1,9 @@
-"""Feed broken files to every reader: the answer is Scans or a clear error, never a hang or crash.
+"""Feed damaged files to every reader: it must return Scans or raise a clear error.
 
     python scripts/fuzz_readers.py --mutations 1000 --seed 0
 
-Each format runs in a process of its own, with a limit on time and memory, so that a crash in a
-compiled library is seen and named. Exit code 0 if all formats pass.
+Each format runs in its own process with limits on time and memory, so that a crash of a compiled
+library is detected and reported. Exit code 0 if all formats pass.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from lardhm_torch import LardHilbertMap
 from lardhm_torch.io.scan_files import load_points, load_scans, save_scans
 from lardhm_torch.scans import Scans
 
-SECONDS_A_FILE = 5  # of the processor
+SECONDS_A_FILE = 5  # processor time
 MEMORY_ON_TOP = 1 << 30  # [bytes] that a reader may need for a file of some kilobytes
 NUM_POINTS = 300
 HUGE = (0, 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
@@ -149,11 +149,11 @@ def mutate(content: bytes, rng: np.random.Generator) -> bytes:
             at = int(rng.integers(min(len(changed) - 8, 400)))
             at = at if rng.random() < 0.7 else len(changed) - 8 - at % len(changed[8:])
             changed[at : at + width] = number.to_bytes(width, "little")
-        elif kind == 5 and changed:  # a piece said twice or left out
+        elif kind == 5 and changed:  # a block repeated or removed
             start, stop = sorted(rng.integers(len(changed) + 1, size=2))
             changed[start:stop] = changed[start:stop] * int(rng.integers(3))
             del changed[4 * len(content) :]
-        elif kind == 6:  # noise put in
+        elif kind == 6:  # random bytes inserted
             at = rng.integers(len(changed) + 1)
             changed[at:at] = rng.bytes(int(rng.integers(1, 30)))
     return bytes(changed)
@@ -195,12 +195,12 @@ def fuzz(name: str, mutations: int, seed: int) -> Counter[str]:
         assert outcome(name, named) == "read"
         for number in range(mutations):
             broken = mutate(content, np.random.default_rng([seed, number]))
-            if name == "e57" and number % 4:  # else the first checksum is all that is tested
+            if name == "e57" and number % 4:  # otherwise only the first checksum would be tested
                 broken = checksums_mended(broken)
             path.write_bytes(broken)
             print(f"{name}: mutation {number} of seed {seed}", file=sys.stderr)
             signal.setitimer(signal.ITIMER_PROF, SECONDS_A_FILE)
-            signal.alarm(60 * SECONDS_A_FILE)  # on the clock: it may wait for ever, too
+            signal.alarm(60 * SECONDS_A_FILE)  # wall time: a reader may also wait forever
             try:
                 counts[outcome(name, named)] += 1
             finally:
@@ -230,10 +230,12 @@ def fuzz_apart(name: str, arguments: argparse.Namespace) -> bool:
 def main() -> int:
     """Fuzz formats one after the other here, or each in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("formats", nargs="*", help=f"{', '.join(FORMATS)}; all that can be read")
-    parser.add_argument("--mutations", type=int, default=1000, help="files per format (1000)")
+    parser.add_argument("formats", nargs="*", help=f"{', '.join(FORMATS)} (default: all)")
+    parser.add_argument(
+        "--mutations", type=int, default=1000, help="files per format (default: 1000)"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--here", action="store_true", help="in this process")
+    parser.add_argument("--here", action="store_true", help="run in this process")
     arguments = parser.parse_args()
     names = arguments.formats or available_formats()
     if not arguments.here:

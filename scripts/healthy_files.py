@@ -1,4 +1,4 @@
-"""Small whole files of every format that is read, written by the formats' own libraries."""
+"""Small valid files of every format that is read, written by the libraries of the formats."""
 
 from __future__ import annotations
 

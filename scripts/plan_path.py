@@ -1,9 +1,9 @@
-"""A path around furniture by gradient descent: Adam moves the waypoints of a straight line.
+"""Plan a path around furniture by gradient descent on its waypoints.
 
-A robot of 25 cm radius crosses the simulated room. The cost is the length of the path, plus what its
-straight pieces expect to meet, plus a push away from obstacles that are too near: all are functions
-of the map, so autograd gives the gradient. Descent finds the nearest valley only, so it starts from
-lines bent to both sides, and the cheapest path is kept.
+A robot of 25 cm radius crosses the simulated room. The cost is the length of the path, plus the hazard
+of its segments, plus a penalty on small clearance. All are differentiable functions of the map. Since
+gradient descent finds a local minimum, it starts from lines curved to both sides, and the path with
+the lowest cost is kept.
 
 Usage: python scripts/plan_path.py [PICTURE]    (default: docs/pictures/question_path.png)
 """
@@ -33,7 +33,9 @@ def at_height(path: Tensor, height: float) -> Tensor:
 
 def cost(model: LardHilbertMap, path: Tensor) -> Tensor:
     """Length [m], obstacles met, and too little clearance, of (W, 2) waypoints."""
-    total = 2 * (WAYPOINTS - 1) * path.diff(dim=0).square().sum()  # short, and even pieces
+    total = (
+        2 * (WAYPOINTS - 1) * path.diff(dim=0).square().sum()
+    )  # short, with segments of equal length
     for height in HEIGHTS:
         points = at_height(path, height)
         total = total + 10 * segment_hazard(model, points[:-1], points[1:]).sum()

@@ -1,8 +1,8 @@
-"""Every table and figure of the paper again, ours beside theirs: writes docs/paper/.
+"""Reproduce every table and figure of the paper; writes docs/paper/.
 
 Usage: python scripts/reproduce_paper.py --data DATA [-o docs/paper] [--only figure_3 table_two ...]
-DATA is the folder that holds one folder for each set, with its `scans.npz`. With --only the other
-results are kept from the run before.
+DATA is a folder with one folder per set, which contains `scans.npz`. With --only, the other results
+are kept from the previous run.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent / "paper"))
 
-EXPERIMENTS = {  # name: module, in the order they run; times first, while the machine is cool
+EXPERIMENTS = {  # name: module, in the order of execution; times first
     "table_one": "timings",
     "table_two": "timings",
     "figure_one": "rings",
@@ -84,10 +84,10 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/paper"))
-    parser.add_argument("--note", default="", help="a sentence on how it was run, for the page")
+    parser.add_argument("--note", default="", help="sentence for the page on how it was run")
     parser.add_argument(
         "--only", nargs="+", choices=list(EXPERIMENTS), default=list(EXPERIMENTS), metavar="NAME",
-        help=f"of {', '.join(EXPERIMENTS)}",
+        help=f"some of {', '.join(EXPERIMENTS)} (default: all)",
     )  # fmt: skip
     return parser.parse_args()
 

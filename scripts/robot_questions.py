@@ -1,4 +1,4 @@
-"""A picture for each question that a robot asks of a map: rays, segments, clearance, frontiers.
+"""Draw a picture of each query: rays, segments, clearance, frontiers.
 
 Usage: python scripts/robot_questions.py [FOLDER]    (default: docs/pictures)
 """

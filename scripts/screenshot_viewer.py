@@ -1,4 +1,4 @@
-"""The picture of the viewer's page: fit a map, open the page in Chromium, take a screenshot.
+"""Take a screenshot of the viewer: fit a map and open the viewer in Chromium.
 
 Usage: python scripts/screenshot_viewer.py SCANS [PICTURE]    (default: docs/pictures/viewer.png)
 """

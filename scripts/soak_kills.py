@@ -1,10 +1,10 @@
-"""Kill a streamed fit at random moments and resume it, again and again, to the end.
+"""Kill an incremental fit at random moments and resume it until it is complete.
 
     python scripts/soak_kills.py --kills 50 --seed 0
 
-Every run is killed with SIGKILL after a random time and goes on with --resume. Checked each time:
-the map file is whole, and no scan but the one that was being learned is lost. Checked at the end: the
-accuracy of the map against that of a run that nobody killed. Exit code 0 if all holds.
+Every run is killed with SIGKILL after a random time and continued with --resume. After each kill, the
+map file must be valid, and at most the current scan may be lost. At the end, the accuracy of the map
+must equal that of an uninterrupted run. Exit code 0 if all checks pass.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lardhm_torch import (
 from lardhm_torch.evaluation.held_out import evaluate
 from lardhm_torch.scans import concatenate_scans
 
-TOLERANCE = 0.005  # of the accuracy
+TOLERANCE = 0.005  # largest difference of accuracy
 STREAM = Path(__file__).with_name("stream.py")
 
 
@@ -76,13 +76,13 @@ def run_killed(files: list[Path], target: Path, kills: int, rng: random.Random) 
                 process.send_signal(signal.SIGKILL)
                 process.communicate()
                 killed += 1
-                _, done = resume_stream(target)  # the file is whole
+                _, done = resume_stream(target)  # raises if the file is damaged
                 if left := list(target.parent.glob(f".*.{target.name}")):
                     sys.exit(f"kill {killed}: {left[0]} was left behind")
                 if done.scans < before:
                     sys.exit(f"kill {killed}: {before} scans became {done.scans}")
                 if done.scans == before:
-                    patience += 0.5  # it was killed before it learned a scan
+                    patience += 0.5  # killed before the first scan was finished
                 before = done.scans
                 continue
         else:
@@ -97,8 +97,10 @@ def main() -> None:
     """Kill, resume, compare."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--scans", type=int, default=20, help="in the stream")
-    parser.add_argument("--rays", type=int, default=9_000, help="of the room, a third a scan")
+    parser.add_argument("--scans", type=int, default=20, help="scans in the stream (default: 20)")
+    parser.add_argument(
+        "--rays", type=int, default=9_000, help="rays of the room, a third per scan (default: 9000)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rng = random.Random(arguments.seed)

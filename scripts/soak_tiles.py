@@ -1,11 +1,11 @@
-"""Kill a fit of tiles at random moments and start it again, again and again, to the end.
+"""Kill the fit of a tiled map at random moments and restart it until it is complete.
 
     python scripts/soak_tiles.py --kills 20 --seed 0
 
-Every other kill takes all ranks of a job under torchrun, the others one rank alone, whose fellows
-torchrun then ends. Checked after each: the map that was there before is whole, and no tile that was
-finished is lost but those in work. Checked at the end of a round: the files are those of a job that
-nobody killed. Exit code 0 if all holds.
+Every other kill stops all ranks of a job under torchrun; the others stop one rank, and torchrun then
+stops the rest. After each kill, the previous map must be valid, and at most the tiles in progress may
+be lost. At the end of a round, the files must equal those of an uninterrupted job. Exit code 0 if all
+checks pass.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def run_killed(folder: Path, kills: int, rng: random.Random) -> int:
     while killed < kills:
         process = start(folder)
         while process.poll() is None and finished(folder) == done:
-            time.sleep(0.005)  # until the ranks have begun to work
+            time.sleep(0.005)  # until the ranks have started
         try:
             process.communicate(timeout=rng.uniform(0.0, spread))
         except subprocess.TimeoutExpired:
@@ -95,7 +95,7 @@ def run_killed(folder: Path, kills: int, rng: random.Random) -> int:
         if not done <= now:
             sys.exit(f"kill {killed}: finished work was lost: {sorted(done - now)[:5]}")
         if read_manifest(folder) != before:
-            break  # it was killed after the tiles were taken over
+            break  # killed after the tiles were moved into place
         print(
             f"kill {killed}: {len(now)} pieces of work are done, {len(now - done)} new", flush=True
         )
@@ -122,7 +122,9 @@ def main() -> None:
     """Kill, go on, compare."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--rays", type=int, default=30_000, help="of the room")
+    parser.add_argument(
+        "--rays", type=int, default=30_000, help="rays of the room (default: 30000)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rng = random.Random(arguments.seed)

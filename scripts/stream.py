@@ -1,10 +1,10 @@
-"""A robot's loop: scan after scan into a map, with checkpoints from which a killed run goes on.
+"""Update a map scan by scan, with checkpoints from which an interrupted run resumes.
 
     python scripts/stream.py scans/ map.pt                       # a folder, or one file of many scans
     python scripts/stream.py scans/ map.pt --resume              # after a kill, with the same scans
     python scripts/stream.py scans/ map.pt --real-time --radius 80
 
-The map file is a whole map at every moment: `lardhm query map.pt ...` works while this runs.
+The map file is valid at any time: `lardhm query map.pt ...` works while this runs.
 """
 
 from __future__ import annotations
@@ -21,12 +21,19 @@ from lardhm_torch.streaming import real_time
 def main() -> None:
     """Read the command line, stream, print the rate."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scans", nargs="+", help="files or folders, in the order of the drive")
+    parser.add_argument("scans", nargs="+", help="files or folders, in the order of recording")
     parser.add_argument("map", type=Path)
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in MAP")
-    parser.add_argument("--real-time", action="store_true", help="fewer rays and free points")
-    parser.add_argument("--radius", type=float, help="[m] forget what is farther from the sensor")
-    parser.add_argument("--checkpoint-every", type=int, default=1, help="scans between two (1)")
+    parser.add_argument("--resume", action="store_true", help="resume from the checkpoint in MAP")
+    parser.add_argument("--real-time", action="store_true", help="use the settings of real_time()")
+    parser.add_argument(
+        "--radius", type=float, help="remove clusters farther than this from the sensor [m]"
+    )
+    parser.add_argument(
+        "--checkpoint-every",
+        type=int,
+        default=1,
+        help="write a checkpoint every N scans (default: 1)",
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     config = StreamConfig(

@@ -1,7 +1,7 @@
-"""Train a map with plain PyTorch: your own loop instead of `fine_tune`.
+"""Train a map with your own PyTorch loop instead of `fine_tune`.
 
-A DataLoader, any optimizer, BCEWithLogitsLoss on `model.log_odds`, a schedule, clipped gradients, a
-running average of the parameters, and a checkpoint every epoch from which the run goes on.
+The loop uses a DataLoader, AdamW, BCEWithLogitsLoss on `model.log_odds`, a learning rate schedule,
+gradient clipping, averaged parameters, and a checkpoint per epoch from which the run resumes.
 
 Usage: python scripts/train_torch.py SCANS -o map.pt [--epochs 8] [--checkpoint run.pt]
 """
@@ -21,15 +21,15 @@ def main(arguments: argparse.Namespace) -> None:
     """Fit a start, train it epoch by epoch, save the averaged map."""
     torch.manual_seed(arguments.seed)
     samples = sample_rays(load_scans(arguments.scans), seed=arguments.seed)
-    # Clusters and a first guess of the weights; everything after this line is plain PyTorch.
+    # Clusters and initial weights; everything after this line is plain PyTorch.
     model = LardHilbertMap(dim=samples.points.shape[1]).fit(
         samples.points, samples.labels, seed=arguments.seed, config=FitConfig(passes=1)
     )
-    model.requires_grad_(True)  # centers and length-scales, too
+    model.requires_grad_(True)  # also centers and length scales
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(0.98))
 
     weights, shape = model.parameter_groups(weight_decay=1e-4)
-    # Weights are log-odds; centers are meters, length-scales logarithms of meters.
+    # Units: weights are log-odds, centers meters, length scales logarithms of meters.
     groups = [weights | {"lr": 0.05}, shape | {"lr": 0.002}]
     optimizer = torch.optim.AdamW(groups)
     loader = DataLoader(
@@ -39,7 +39,7 @@ def main(arguments: argparse.Namespace) -> None:
         optimizer, [0.05, 0.002], epochs=arguments.epochs, steps_per_epoch=len(loader)
     )
     free_per_hit = (samples.labels == 0).sum() / samples.labels.sum()
-    loss_of = nn.BCEWithLogitsLoss(pos_weight=free_per_hit)  # hits are few: weigh them up
+    loss_of = nn.BCEWithLogitsLoss(pos_weight=free_per_hit)  # hits are few
 
     kept = {"model": model, "average": average, "optimizer": optimizer, "schedule": schedule}
     first = 0
@@ -77,5 +77,7 @@ if __name__ == "__main__":
     parser.add_argument("--epochs", type=int, default=8)
     parser.add_argument("--batch", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--checkpoint", help="written every epoch; the run goes on if it exists")
+    parser.add_argument(
+        "--checkpoint", help="written every epoch; the run resumes from it if it exists"
+    )
     main(parser.parse_args())

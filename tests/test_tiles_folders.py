@@ -113,7 +113,7 @@ def test_the_verbs_make_a_map_of_tiles_and_add_to_it(tmp_path, files, capsys):
         room_manifest(tmp_path / "same", files[:2]), tiles=read_manifest(folder).tiles
     )
     assert main(["update", folder, files[2]]) == 0
-    assert "tiles were touched" in capsys.readouterr().out
+    assert "tiles were updated" in capsys.readouterr().out
     assert read_ledger(folder).rays == 900
 
 
@@ -130,19 +130,19 @@ def test_join_takes_two_folders_or_two_map_files(tmp_path, files, capsys):
         assert main(["tile", file, "-o", name, "--edge", str(EDGE)]) == 0
         assert main(["fit", file, "-o", f"{name}.pt"]) == 0
     assert main(["join", *names[:2], "-o", names[2]]) == 0
-    assert "of them as they were" in capsys.readouterr().out
+    assert "of them unchanged" in capsys.readouterr().out
     assert len(TiledMap.open(names[2])) > 0
     assert main(["join", f"{names[0]}.pt", f"{names[1]}.pt", "-o", f"{names[2]}.pt"]) == 0
     assert len(LardHilbertMap.load(f"{names[2]}.pt")) > 0
     assert main(["join", names[0], f"{names[1]}.pt", "-o", names[2]]) == 1
-    assert "both must be map files or both tiled folders" in capsys.readouterr().err
+    assert "two map files or two tiled maps" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["-o", "elsewhere.pt"], "--output must be left out"),
-        (["--clusters", "5"], "--clusters and --radius belong to map files"),
+        (["-o", "elsewhere.pt"], "--output must be omitted"),
+        (["--clusters", "5"], "--clusters and --radius do not apply to tiled maps"),
     ],
 )
 def test_update_of_a_folder_refuses_what_it_cannot_do(tmp_path, files, capsys, options, message):
@@ -150,4 +150,4 @@ def test_update_of_a_folder_refuses_what_it_cannot_do(tmp_path, files, capsys, o
     assert main(["update", str(folder), files[0], *options]) == 1
     assert message in capsys.readouterr().err
     assert main(["update", str(tmp_path / "map.pt"), files[0]]) == 1
-    assert "--output FILE is needed" in capsys.readouterr().err
+    assert "--output is required" in capsys.readouterr().err

@@ -1,67 +1,77 @@
-"""Verbs that make maps of scans."""
+"""Subcommands that make scans, and maps from scans."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from lardhm_torch.cli.outputs import MAP_SUFFIXES, check_output
 from lardhm_torch.cli.scan_files import iter_scans_of, read_scans, report_dropped
 from lardhm_torch.cli.tiling import update_folder
 
-# torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
+if TYPE_CHECKING:
+    from lardhm_torch import LardHilbertMap, Samples, Scans
+
+# Imports of torch are inside the functions: `lardhm --help` must be fast.
 
 
 def simulate(arguments: argparse.Namespace) -> None:
-    """Scans of the simulated room to a file."""
+    """Simulate scans of a furnished room."""
     from lardhm_torch import save_scans, simulate_room
 
+    check_output(arguments.output, (".npz",))
     scans = simulate_room(num_rays=arguments.rays, seed=arguments.seed)
     save_scans(scans, arguments.output)
     print(f"{len(scans)} rays of {scans.num_scans} scans -> {arguments.output}")
 
 
 def split(arguments: argparse.Namespace) -> None:
-    """Whole rays to a training and a test file."""
+    """Split scans at random into training and test rays."""
     from lardhm_torch import save_scans, split_rays
 
-    parts = split_rays(read_scans(arguments), arguments.ratio, arguments.seed)
+    for path in arguments.output:
+        check_output(path, (".npz",), arguments.scans)
+    if len({Path(path).resolve() for path in arguments.output}) == 1:
+        raise ValueError(f"--output must be two different files; got {arguments.output[0]} twice")
+    scans = read_scans(arguments)
+    if len(scans) < 2:
+        raise ValueError(f"SCANS must hold at least two rays to be split; got {len(scans)}")
+    parts = split_rays(scans, arguments.ratio, seed=arguments.seed)
     for part, path in zip(parts, arguments.output, strict=True):
         save_scans(part, path)
         print(f"{len(part)} rays -> {path}")
 
 
 def fit(arguments: argparse.Namespace) -> None:
-    """Scans to a map."""
-    from lardhm_torch import LardHilbertMap, fine_tune, sample_rays
-    from lardhm_torch.io.map_files import load_state, save_state
-
+    """Fit a map to scans."""
+    check_output(arguments.output, MAP_SUFFIXES, arguments.scans)
+    if arguments.tune_state is not None:
+        inputs = [*arguments.scans, arguments.output]
+        check_output(arguments.tune_state, MAP_SUFFIXES, inputs, option="--tune-state")
     if arguments.incremental:
         _fit_incrementally(arguments)
-        return
+    else:
+        _fit_at_once(arguments)
+
+
+def _fit_at_once(arguments: argparse.Namespace) -> None:
+    from lardhm_torch import sample_rays
+
     if arguments.resume or arguments.view or arguments.radius is not None:
-        raise ValueError(
-            "--resume, --view and --radius belong to --incremental, which is not given"
-        )
+        raise ValueError("--resume, --view and --radius need --incremental")
+    state = _tune_state(arguments.tune_state)
     scans = read_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
     report_dropped(samples.dropped)
-    settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
-    model = LardHilbertMap(scans.dim, **settings)
+    model = _new_map(scans.dim, arguments)
     model.fit(
         samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True
     )
     if arguments.tune or arguments.tune_state:
-        path = arguments.tune_state
-        fine_tune(
-            model,
-            samples.points,
-            samples.labels,
-            resample=lambda epoch: sample_rays(scans, seed=arguments.seed + epoch),
-            seed=arguments.seed,
-            state=load_state(path) if path and Path(path).exists() else None,
-            after_epoch=(lambda state: save_state(state, path)) if path else None,
-            progress=True,
-        )
+        _tune(model, scans, samples, state, arguments)
     model.save(arguments.output)
     hits = int(samples.labels.sum())
     print(
@@ -70,14 +80,57 @@ def fit(arguments: argparse.Namespace) -> None:
     )
 
 
+def _new_map(dim: int, arguments: argparse.Namespace) -> LardHilbertMap:
+    from lardhm_torch import LardHilbertMap
+
+    settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
+    return LardHilbertMap(dim, **settings)
+
+
+def _tune_state(path: str | None) -> dict[str, Any] | None:
+    """The checkpoint of an earlier fine-tuning run; None if there is none."""
+    from lardhm_torch.io.map_files import load_state
+
+    if path is None or not Path(path).exists():
+        return None
+    state = load_state(path)
+    if not {"config", "epoch"} <= state.keys():
+        raise ValueError(f"--tune-state must be a checkpoint of fine-tuning; {path} is not")
+    return state
+
+
+def _tune(
+    model: LardHilbertMap,
+    scans: Scans,
+    samples: Samples,
+    state: dict[str, Any] | None,
+    arguments: argparse.Namespace,
+) -> None:
+    """Fine-tune with free points sampled anew in every epoch."""
+    from lardhm_torch import fine_tune, sample_rays
+    from lardhm_torch.io.map_files import save_state
+
+    path = arguments.tune_state
+    fine_tune(
+        model,
+        samples.points,
+        samples.labels,
+        resample=lambda epoch: sample_rays(scans, seed=arguments.seed + epoch),
+        seed=arguments.seed,
+        state=state,
+        after_epoch=(lambda state: save_state(state, path)) if path else None,
+        progress=True,
+    )
+
+
 def _fit_incrementally(arguments: argparse.Namespace) -> None:
-    """One scan after the other, with checkpoints in the output file."""
+    """Update an empty map, or that of a checkpoint, with one scan at a time."""
     import itertools
 
-    from lardhm_torch import LardHilbertMap, StreamConfig, resume_stream, stream_scans
+    from lardhm_torch import StreamConfig, resume_stream, stream_scans
 
-    if arguments.tune:
-        raise ValueError("--tune needs all scans at once; leave out --incremental")
+    if arguments.tune or arguments.tune_state:
+        raise ValueError("--tune and --tune-state need all scans at once; omit --incremental")
     config = StreamConfig(
         num_clusters=arguments.clusters,
         radius=arguments.radius,
@@ -88,33 +141,44 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
     if arguments.resume:
         model, done = resume_stream(arguments.output)
     else:
-        first = next(scans)
+        first = next(scans, None)
+        if first is None:
+            raise ValueError("SCANS must hold at least one ray; got none")
         scans, done = itertools.chain([first], scans), None
-        settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
-        model = LardHilbertMap(first.dim, **settings)
-    live = None
-    if arguments.view:
-        from lardhm_torch.viewing.viewer import LiveView
-
-        live = LiveView()
-    try:
+        model = _new_map(first.dim, arguments)
+    with _live_view(arguments.view) as after_scan:
         seen = stream_scans(
             model, scans, config, path=arguments.output, done=done,
-            after_scan=live.update if live else None, progress=True,
+            after_scan=after_scan, progress=True,
         )  # fmt: skip
-    finally:
-        if live:
-            live.close()
+    if len(model) == 0:
+        raise ValueError(f"SCANS must hold a usable ray; the map of {seen.scans} scans is empty")
     print(f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}")
 
 
+@contextmanager
+def _live_view(is_wanted: bool) -> Iterator[Callable[[LardHilbertMap], None] | None]:
+    """The function that shows a map in the browser after each scan; None if not wanted."""
+    if not is_wanted:
+        yield None
+        return
+    from lardhm_torch.viewing.viewer import LiveView
+
+    live = LiveView()
+    try:
+        yield live.update
+    finally:
+        live.close()
+
+
 def update(arguments: argparse.Namespace) -> None:
-    """More scans into a map, one after the other; a tiled map is updated in place."""
+    """Update a map with more scans, one at a time."""
     if Path(arguments.map).is_dir():
         update_folder(arguments)
         return
     if arguments.output is None:
-        raise ValueError("--output FILE is needed; only a tiled map is updated in place")
+        raise ValueError("--output is required for a map file; only a tiled map needs none")
+    check_output(arguments.output, MAP_SUFFIXES, arguments.scans)
     from lardhm_torch import LardHilbertMap, StreamConfig, stream_scans
 
     model = LardHilbertMap.load(arguments.map)
@@ -123,6 +187,8 @@ def update(arguments: argparse.Namespace) -> None:
     )
     before = len(model)
     seen = stream_scans(model, iter_scans_of(arguments, model.dim), config, progress=True)
+    if seen.rays == 0:
+        raise ValueError("SCANS must hold at least one ray; got none")
     model.save(arguments.output)
     print(
         f"{seen.scans} scans, {seen.rays} rays -> {before} clusters became {len(model)} "

@@ -1,22 +1,26 @@
-"""What may stand on the command line."""
+"""The command line parser."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from typing import Any
 
-from lardhm_torch.cli import asking, learning, tiling
+from lardhm_torch.cli import learning, queries, tiling
+
+MAP = "map file, or folder of a tiled map"
+FOLDER = "folder of the tiled map"
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Every verb with its arguments; `arguments.run(arguments)` does it."""
+    """Return the parser of all subcommands; `arguments.run(arguments)` runs the chosen one."""
     parser = argparse.ArgumentParser(
         prog="lardhm",
-        description="Continuous, probabilistic maps of occupancy from range scans.",
-        epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las, "
-        "e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
+        description="Continuous, probabilistic occupancy maps from range scans.",
+        epilog="SCANS is one file, several files, or a folder. Formats: npz, ply, pcd, xyz, csv, "
+        "las, laz, KITTI bin, e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
     )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="COMMAND")
 
     def verb(run: Any, **defaults: Any) -> argparse.ArgumentParser:
         sub = verbs.add_parser(
@@ -26,175 +30,316 @@ def make_parser() -> argparse.ArgumentParser:
         return sub
 
     _scan_verbs(verb)
-    _map_verbs(verb)
+    _fit(verb(learning.fit))
+    _update(verb(learning.update))
+    _file_verbs(verb)
+    _picture_verbs(verb)
+    _evaluation_verbs(verb)
     _tile_verbs(verb)
     return parser
 
 
 def _scan_verbs(verb: Any) -> None:
     sub = verb(learning.simulate)
-    _output(sub)
-    sub.add_argument("--rays", type=int, default=50_000, help="number of rays (50000)")
+    _output(sub, "scans to write: .npz")
+    sub.add_argument(
+        "--rays", type=int, default=50_000, metavar="N", help="number of rays (default: 50000)"
+    )
     _seed(sub)
 
     sub = verb(learning.split)
     _scans(sub)
-    sub.add_argument("--ratio", type=float, default=0.5, help="share that trains (0.5)")
+    sub.add_argument(
+        "--ratio", type=float, default=0.5, help="fraction of training rays (default: 0.5)"
+    )
     _seed(sub)
-    sub.add_argument("-o", "--output", nargs=2, required=True, metavar=("TRAIN", "TEST"))
+    sub.add_argument(
+        "-o",
+        "--output",
+        nargs=2,
+        required=True,
+        metavar=("TRAIN", "TEST"),
+        help="scans to write: two .npz files",
+    )
 
-    sub = verb(learning.fit)
+
+def _fit(sub: argparse.ArgumentParser) -> None:
     _scans(sub)
-    _output(sub)
-    sub.add_argument("--clusters", type=int, help="total number (chosen from the data)")
-    sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
-    sub.add_argument("--tune", action="store_true", help="also learn centers and length-scales")
+    _output(sub, "map to write: .pt, .pth or .safetensors")
+    _clusters(sub, "total number of clusters (default: chosen from the data)")
+    _neighbors(sub)
+    sub.add_argument(
+        "--tune",
+        action="store_true",
+        help="fine-tune centers, length scales and weights by backpropagation",
+    )
     sub.add_argument(
         "--tune-state",
         metavar="FILE",
-        help="--tune, saved after every epoch; continued if it exists",
-    )
-    sub.add_argument("--incremental", action="store_true", help="one scan after the other")
-    sub.add_argument("--resume", action="store_true", help="go on from the checkpoint in FILE")
-    sub.add_argument(
-        "--view", action="store_true", help="--incremental with a page of the live map"
+        help="fine-tune, write a checkpoint to FILE after every epoch, and resume from it if it "
+        "exists",
     )
     sub.add_argument(
-        "--checkpoint-every", type=int, default=1, metavar="N", help="scans between two (1)"
+        "--incremental", action="store_true", help="update the map with one scan at a time"
+    )
+    sub.add_argument(
+        "--resume",
+        action="store_true",
+        help="with --incremental: resume from the checkpoint in the output file",
+    )
+    sub.add_argument(
+        "--view", action="store_true", help="with --incremental: show the map in the browser"
+    )
+    sub.add_argument(
+        "--checkpoint-every",
+        type=int,
+        default=1,
+        metavar="N",
+        help="with --incremental: write a checkpoint every N scans (default: 1)",
     )
     _radius(sub)
-    sub.add_argument("--dim", type=int, help="2 drops a constant last column")
+    _dim(sub)
     _seed(sub)
 
 
-def _map_verbs(verb: Any) -> None:
-    sub = verb(learning.update)
-    sub.add_argument("map")
+def _update(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("map", metavar="MAP", help=MAP)
     _scans(sub)
-    sub.add_argument("-o", "--output", metavar="FILE", help="needed unless MAP is a tiled folder")
-    sub.add_argument("--clusters", type=int, help="of a scan in an unknown place (from the data)")
+    sub.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help="map to write, which may be MAP itself; omit it for a tiled map, which is updated in place",
+    )
+    _clusters(sub, "clusters of a scan of an unknown place (default: chosen from the data)")
     _radius(sub)
     _seed(sub)
 
-    sub = verb(asking.query)
-    sub.add_argument("map")
-    sub.add_argument("points", help=".npy or .npz of (N, D), or any scan file")
-    _output(sub)
 
-    sub = verb(asking.mesh)
-    sub.add_argument("map")
-    _output(sub)
-    sub.add_argument("--resolution", type=float, default=0.05, help="lattice cell [m] (0.05)")
-    _add_surface(sub)
-    sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
+def _file_verbs(verb: Any) -> None:
+    sub = verb(queries.query)
+    sub.add_argument("map", metavar="MAP", help=MAP)
+    sub.add_argument(
+        "points", metavar="POINTS", help="(N, D) points as .npy or .npz, or any scan file"
+    )
+    _output(sub, "float32 probabilities to write, in the order of the points: .npy")
 
-    sub = verb(asking.grid)
-    sub.add_argument("map")
-    _output(sub)
-    sub.add_argument("--resolution", type=float, default=0.1, help="edge of a cell [m] (0.1)")
+    sub = verb(queries.mesh)
+    sub.add_argument("map", metavar="MAP", help=MAP)
+    _output(sub, "mesh to write: .ply, .obj, .glb, .off or .stl")
+    _resolution(sub, 0.05)
+    _surface(sub)
 
-    sub = verb(asking.view)
-    sub.add_argument("map")
+    sub = verb(queries.grid)
+    sub.add_argument("map", metavar="MAP", help=MAP)
+    _output(sub, "grid to write: .npz, or .bt or .ot for OctoMap")
+    _resolution(sub, 0.1)
+
+
+def _picture_verbs(verb: Any) -> None:
+    sub = verb(queries.view)
+    sub.add_argument("map", metavar="MAP", help=MAP)
     _scans(sub, nargs="*")
-    sub.add_argument("--host", default="127.0.0.1", help="0.0.0.0: for other machines, too")
-    sub.add_argument("--port", type=int, default=8080, help="of the page (8080 or the next free)")
-    sub.add_argument("--resolution", type=float, help="of the surface [m] (from the map)")
-    sub.add_argument("--export", metavar="FILE", help="write the scene to .html or .viser and end")
+    sub.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to serve on; 0.0.0.0 allows other machines (default: 127.0.0.1)",
+    )
+    sub.add_argument(
+        "--port",
+        type=int,
+        default=8080,
+        help="port to serve on; the next free one is used if it is taken (default: 8080)",
+    )
+    sub.add_argument(
+        "--resolution", type=float, help="cell size of the surface [m] (default: from the map)"
+    )
+    sub.add_argument(
+        "--export", metavar="FILE", help="write the scene to a .html or .viser file and exit"
+    )
 
-    sub = verb(asking.render)
-    sub.add_argument("map")
-    _output(sub)
-    sub.add_argument("--slice", type=float, metavar="Z", help="the probability at this height [m]")
-    sub.add_argument("--resolution", type=float, default=0.05, help="lattice cell [m] (0.05)")
-    _add_surface(sub)
-    sub.add_argument("--color", choices=("height", "cluster", "probability"), default="height")
-    sub.add_argument("--azimuth", type=float, default=-60.0, help="of the camera [degrees] (-60)")
-    sub.add_argument("--elevation", type=float, default=40.0, help="of the camera [degrees] (40)")
-    sub.add_argument("--cut-above", type=float, metavar="Z", help="leave out what is higher [m]")
+    sub = verb(queries.render)
+    sub.add_argument("map", metavar="MAP", help=MAP)
+    _output(sub, "picture to write: .png")
+    sub.add_argument(
+        "--slice", type=_finite, metavar="Z", help="draw the probability at height Z [m] instead"
+    )
+    _resolution(sub, 0.05)
+    _surface(sub)
+    sub.add_argument(
+        "--azimuth", type=_finite, default=-60.0, help="camera azimuth [degrees] (default: -60)"
+    )
+    sub.add_argument(
+        "--elevation", type=_finite, default=40.0, help="camera elevation [degrees] (default: 40)"
+    )
+    sub.add_argument(
+        "--cut-above", type=_finite, metavar="Z", help="remove the surface above height Z [m]"
+    )
 
-    sub = verb(asking.evaluate)
-    sub.add_argument("map")
+
+def _evaluation_verbs(verb: Any) -> None:
+    sub = verb(queries.evaluate)
+    sub.add_argument("map", metavar="MAP", help=MAP)
     _scans(sub)
     sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    sub.add_argument("--reliability", metavar="FILE", help="reliability diagrams, .png")
+    sub.add_argument(
+        "--reliability", metavar="FILE", help="also draw reliability diagrams to a .png file"
+    )
     _seed(sub)
 
-    sub = verb(asking.info)
-    sub.add_argument("map")
-    sub.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    sub = verb(queries.info)
+    sub.add_argument("map", metavar="MAP", help=MAP)
+    sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def _tile_verbs(verb: Any) -> None:
     sub = verb(tiling.tile)
     _scans(sub)
-    sub.add_argument("-o", "--output", required=True, metavar="FOLDER")
-    sub.add_argument("--edge", type=float, default=20.0, help="of a tile [m] (20)")
-    sub.add_argument("--halo", type=float, help="around a tile, trained with it [m] (0.5)")
-    sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
-    sub.add_argument("--dim", type=int, help="2 drops a constant last column")
+    sub.add_argument("-o", "--output", required=True, metavar="FOLDER", help=FOLDER)
+    sub.add_argument("--edge", type=float, default=20.0, help="edge of a tile [m] (default: 20)")
+    sub.add_argument(
+        "--halo",
+        type=float,
+        help="width of the margin around a tile whose points also train it [m] (default: 0.5)",
+    )
+    _neighbors(sub)
+    _dim(sub)
     _seed(sub)
 
     sub = verb(tiling.fit_tiles)
-    sub.add_argument("folder")
+    sub.add_argument("folder", metavar="FOLDER", help=FOLDER)
 
     sub = verb(tiling.join)
-    sub.add_argument("maps", nargs=2, metavar="MAP")
-    sub.add_argument("-o", "--output", required=True, metavar="FILE")
+    sub.add_argument("maps", nargs=2, metavar="MAP", help="two map files, or two tiled maps")
+    _output(sub, "map file to write, or folder of the new tiled map")
     _seed(sub)
 
 
+# --- arguments that several subcommands share ---
+
+
 def _scans(sub: argparse.ArgumentParser, nargs: str = "+") -> None:
-    sub.add_argument("scans", nargs=nargs, metavar="SCANS")
+    sub.add_argument(
+        "scans", nargs=nargs, metavar="SCANS", help="scan file, several files, or a folder"
+    )
     sub.add_argument(
         "--origin",
         type=_numbers,
         metavar="X,Y,Z",
-        help="sensor position of files that do not tell it",
+        help="sensor position for files that do not contain one [m]",
     )
     sub.add_argument(
         "--frame",
         choices=("sensor", "world"),
-        help="of points beside a pose file: moved by the poses, or only seen from there",
+        help="frame of the points beside a pose file. sensor: the poses transform them; world: "
+        "the poses only give the sensor positions (default: world, and pose files are not read)",
     )
     sub.add_argument(
-        "--topic", action="append", default=[], help="of a bag's clouds or poses, if there are more"
+        "--topic",
+        action="append",
+        default=[],
+        help="topic of a bag's point clouds or poses; needed if there are several",
     )
     sub.add_argument(
-        "--camera", type=_numbers, metavar="FX,FY,CX,CY", help="of depth images without intrinsics"
+        "--camera",
+        type=_numbers,
+        metavar="FX,FY,CX,CY",
+        help="intrinsics of depth images that come without them [pixels]",
     )
     sub.add_argument(
-        "--pixel-step", type=int, default=4, help="of depth images, rows and columns read (4)"
+        "--pixel-step",
+        type=int,
+        default=4,
+        metavar="N",
+        help="read every Nth row and column of depth images (default: 4)",
     )
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(part) for part in text.split(","))
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"must be numbers separated by commas; got {text!r}"
+        ) from error
 
 
-def _output(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("-o", "--output", required=True, metavar="FILE")
+def _finite(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a finite number; got {text!r}")
+    return value
+
+
+def _output(sub: argparse.ArgumentParser, text: str) -> None:
+    sub.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
+
+
+def _clusters(sub: argparse.ArgumentParser, text: str) -> None:
+    sub.add_argument("--clusters", type=int, metavar="N", help=text)
+
+
+def _neighbors(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--neighbors",
+        type=int,
+        metavar="K",
+        help="nearest clusters used per query point (default: 16)",
+    )
+
+
+def _dim(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--dim",
+        type=int,
+        help="dimension of the map; 2 drops a constant last coordinate (default: that of the "
+        "scans)",
+    )
 
 
 def _radius(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
-        "--radius", type=float, metavar="METERS", help="forget what is farther from the sensor"
+        "--radius",
+        type=float,
+        metavar="METERS",
+        help="after each scan, remove clusters farther than this from the sensor (default: keep "
+        "all)",
     )
 
 
 def _seed(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--seed", type=int, default=0, help="of everything random (0)")
+    sub.add_argument("--seed", type=int, default=0, help="random seed (default: 0)")
 
 
-def _add_surface(sub: argparse.ArgumentParser) -> None:
+def _resolution(sub: argparse.ArgumentParser, default: float) -> None:
+    sub.add_argument(
+        "--resolution",
+        type=float,
+        default=default,
+        help="cell size [m] (default: %(default)s)",
+    )
+
+
+def _surface(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--threshold",
         type=float,
         default=0.5,
-        help="of the probability: what exceeds it is occupied (0.5)",
+        help="probability above which space is occupied (default: 0.5)",
     )
     sub.add_argument(
         "--surface",
         choices=("peak", "crossing"),
         default="peak",
-        help="where the hits lie, or where the probability is the threshold (peak)",
+        help="peak: the ridge of the log-odds, where the hits lie; crossing: the level set of the "
+        "probability at the threshold (default: peak)",
+    )
+    sub.add_argument(
+        "--color",
+        choices=("height", "cluster", "probability"),
+        default="height",
+        help="what vertex colors show (default: height)",
     )

@@ -1,4 +1,4 @@
-"""SCANS of the command line."""
+"""Reading the SCANS arguments of the command line."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _with_dim(scans: Scans, arguments: argparse.Namespace, dim: int | None) -> Scans:
-    dim = getattr(arguments, "dim", None) or dim or scans.dim
+    asked = getattr(arguments, "dim", None)
+    dim = next(value for value in (asked, dim, scans.dim) if value is not None)
     if dim == scans.dim - 1:
         return scans.drop_constant_column()
     if dim != scans.dim:

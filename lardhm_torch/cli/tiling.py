@@ -1,4 +1,4 @@
-"""Verbs that make tiled maps: folders of tiles, for maps larger than memory."""
+"""Subcommands for tiled maps, and for merging maps."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import argparse
 import os
 from pathlib import Path
 
+from lardhm_torch.cli.outputs import MAP_SUFFIXES, check_folder, check_output
 from lardhm_torch.cli.scan_files import iter_pieces_of
 
-# torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
+# Imports of torch are inside the functions: `lardhm --help` must be fast.
 
 
 def tile(arguments: argparse.Namespace) -> None:
-    """Scans, larger than memory if need be, to the training points of tiles."""
+    """Distribute the training points of scans, which may exceed memory, to tiles."""
     from lardhm_torch.tiles.routing import TilingConfig, tile_scans
 
     config = TilingConfig(
@@ -21,6 +22,7 @@ def tile(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
         num_neighbors=arguments.neighbors,
     )
+    check_folder(arguments.output, arguments.scans)
     ledger = tile_scans(iter_pieces_of(arguments), arguments.output, config, progress=True)
     points = sum(counts.core for counts in ledger.tiles.values())
     print(
@@ -30,7 +32,7 @@ def tile(arguments: argparse.Namespace) -> None:
 
 
 def fit_tiles(arguments: argparse.Namespace) -> None:
-    """The tiles of a folder to maps; also under torchrun, and again after a kill."""
+    """Fit the tiles of a folder; resumes after an interruption and runs under torchrun."""
     from lardhm_torch.tiles import fitting
 
     manifest = fitting.fit_tiles(arguments.folder, progress=True)
@@ -40,39 +42,39 @@ def fit_tiles(arguments: argparse.Namespace) -> None:
 
 
 def update_folder(arguments: argparse.Namespace) -> None:
-    """More scans into a tiled map, in place: only the tiles that they touch are fitted anew."""
+    """Update a tiled map in place; only the tiles that contain new points are fitted again."""
     from lardhm_torch.tiles.fitting import fit_tiles
     from lardhm_torch.tiles.manifest import read_manifest
     from lardhm_torch.tiles.routing import add_scans
 
     if arguments.output is not None and Path(arguments.output) != Path(arguments.map):
-        raise ValueError(f"--output must be left out: {arguments.map} is updated in place")
+        raise ValueError(f"--output must be omitted: {arguments.map} is updated in place")
     if arguments.clusters is not None or arguments.radius is not None:
-        raise ValueError("--clusters and --radius belong to map files, not to tiled maps")
+        raise ValueError("--clusters and --radius do not apply to tiled maps")
     dim = read_manifest(arguments.map).dim
     _, touched = add_scans(iter_pieces_of(arguments, dim), arguments.map, progress=True)
     manifest = fit_tiles(arguments.map, progress=True)
-    print(f"{len(touched)} of {len(manifest.tiles)} tiles were touched -> {arguments.map}")
+    print(f"{len(touched)} of {len(manifest.tiles)} tiles were updated -> {arguments.map}")
 
 
 def join(arguments: argparse.Namespace) -> None:
-    """Two maps of one world frame to one: two map files, or two tiled folders."""
+    """Merge two maps in the same world frame."""
     from lardhm_torch import LardHilbertMap, merge_maps
     from lardhm_torch.tiles import fitting
     from lardhm_torch.tiles.folders import join_folders
 
     first, second = arguments.maps
     if Path(first).is_dir() != Path(second).is_dir():
-        raise ValueError(f"both must be map files or both tiled folders; got {first} and {second}")
+        raise ValueError(f"MAPs must be two map files or two tiled maps; got {first} and {second}")
     if not Path(first).is_dir():
+        check_output(arguments.output, MAP_SUFFIXES, arguments.maps)
         model = merge_maps(
             LardHilbertMap.load(first), LardHilbertMap.load(second), seed=arguments.seed
         )
         model.save(arguments.output)
         print(f"{len(model)} clusters -> {arguments.output}")
         return
+    check_folder(arguments.output, arguments.maps)
     kept = join_folders(first, second, arguments.output)
     manifest = fitting.fit_tiles(arguments.output, progress=True)
-    print(
-        f"{len(manifest.tiles)} tiles, {len(kept.tiles)} of them as they were -> {arguments.output}"
-    )
+    print(f"{len(manifest.tiles)} tiles, {len(kept.tiles)} of them unchanged -> {arguments.output}")

@@ -121,8 +121,18 @@ def reliability_held_out(answers: HeldOut) -> dict[str, Tensor]:
 def evaluate(
     model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0
 ) -> dict[str, dict[str, float]]:
-    """Scores of a map on held-out rays, for each kind of free point: unif, near, paper.
+    """Evaluate a map on held-out rays.
 
-    Arguments and errors are those of `answer_held_out`.
+    Args:
+        model: (N, D) world positions [m] -> (N,) probability of occupancy.
+        scans: rays that were not used for training.
+        seed: random seed of the test points.
+
+    Returns:
+        For each kind of free point (``unif``, ``near``, ``paper``) the scores of
+        `scores.occupancy_metrics` by name.
+
+    Raises:
+        ValueError: no ray is usable, or the model does not return (N,) probabilities.
     """
     return score_held_out(answer_held_out(model, scans, seed))

@@ -33,7 +33,7 @@ def save_grid(
     resolution: float = 0.1,
     bounds: tuple[Any, Any] | None = None,
 ) -> int:
-    """Write the map as a grid of cells, in the format of the extension; the number of cells.
+    """Write the map as a grid of cells, in the format of the extension.
 
     Cells lie at whole multiples of the resolution.
 
@@ -51,7 +51,10 @@ def save_grid(
         model: a map; for OctoMap a 3-D one.
         path: a file that ends in .npz, .bt or .ot; an old one is replaced at the end.
         resolution: edge of a cell [m].
-        bounds: lower and upper corner of the part to write, world frame [m]; left out: all of it.
+        bounds: lower and upper corner of the part to write, world frame [m]; None: all of it.
+
+    Returns:
+        The number of cells written.
 
     Raises:
         ValueError: the extension is another, the map is empty or has the wrong dimension, or the

@@ -23,6 +23,10 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
     Far from zero (UTM) float32 is too coarse for a mesh: .ply then holds float64, .glb a mesh near
     zero and a shift; .obj and .off hold text anyway; .stl cannot, and a warning says so.
 
+    Args:
+        mesh: the mesh [m].
+        path: file that ends in .glb, .obj, .off, .ply or .stl.
+
     Raises:
         ValueError: the extension is not one of .glb, .obj, .off, .ply, .stl.
         FileNotFoundError: the folder of path does not exist.

@@ -101,6 +101,9 @@ def load_scans(
         topic: of a bag's clouds, of its poses, or both; needed if there are several.
         camera: of a folder of depth images.
 
+    Returns:
+        All scans, world frame.
+
     Raises:
         FileNotFoundError: there is no such file or folder.
         ValueError: a file cannot be read, has no sensor position, or is of another dimension.
@@ -136,11 +139,22 @@ def iter_scans(
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
 ) -> Iterator[Scans]:
-    """The scans of `load_scans` one by one, each with its own origin alone.
+    """Read the scans of `load_scans` one at a time.
 
-    A file is read when its turn comes, so that a folder of any length needs the memory of one file.
+    Each file is read when it is needed, so that a folder of any length needs the memory of one file.
 
-    Args and errors: as `load_scans`; an error comes when the file's turn comes.
+    Args:
+        path: a file, a folder, or several of them.
+        origin: see `load_scans`.
+        frame: see `load_scans`.
+        topic: see `load_scans`.
+        camera: see `load_scans`.
+
+    Yields:
+        One scan each, as `Scans` with a single origin.
+
+    Raises:
+        FileNotFoundError, ValueError, ImportError: see `load_scans`; raised when the file is read.
     """
     for file in expand_paths(path, _READERS, _kind_of_folder):
         scans = load_scans(file, origin, frame=frame, topic=topic, camera=camera)
@@ -181,7 +195,11 @@ def iter_pieces(
 
 
 def save_scans(scans: Scans, path: PathLike) -> None:
-    """Write scans as ``.npz``; the file at path is the old one or the new one, never half of it.
+    """Write scans as ``.npz``, atomically.
+
+    Args:
+        scans: range scans, world frame.
+        path: file that ends in .npz; an existing file is replaced.
 
     Raises:
         ValueError: path does not end in .npz.
@@ -201,7 +219,13 @@ def save_scans(scans: Scans, path: PathLike) -> None:
 
 
 def load_points(path: PathLike) -> Tensor:
-    """(N, D) float64 points of one file [m]: ``.npy``, ``.npz`` with ``points``, or a scan file.
+    """Read the points of one file: ``.npy``, ``.npz`` with ``points``, or a scan file.
+
+    Args:
+        path: the file.
+
+    Returns:
+        (N, D) float64 positions [m].
 
     Raises:
         FileNotFoundError: there is no such file.

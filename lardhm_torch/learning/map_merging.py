@@ -121,6 +121,9 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
             `LardHilbertMap.transform`).
         seed: of the recalled points and the training.
 
+    Returns:
+        A new map, in the frame of the first.
+
     Raises:
         ValueError: the settings differ.
 

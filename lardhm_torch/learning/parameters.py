@@ -310,6 +310,10 @@ def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> 
     An optimizer without a state per parameter (plain SGD) needs nothing after growth; Adam or
     momentum would fail with a shape mismatch. Old rows keep their state, new ones start at 0.
 
+    Args:
+        optimizer: an optimizer of the map's parameters.
+        model: the map, after `update`.
+
     Raises:
         ValueError: the map has fewer clusters than the state: rows are gone (`crop`, `fit`) and
             which is not known. Make a new optimizer.

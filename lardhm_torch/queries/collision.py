@@ -128,9 +128,19 @@ def _segment_hazard(model: Any, starts: Tensor, ends: Tensor, radius: float, ste
 def free_probability(
     model: Any, starts: Tensor, ends: Tensor, mover: Mover | None = None
 ) -> Tensor:
-    """(S,) probability that nothing is met on the way from (S, D) starts to (S, D) ends.
+    """Probability that straight segments are free of collisions: exp(-`segment_hazard`).
 
-    exp(-`segment_hazard`), with its arguments and errors.
+    Args:
+        model: a map.
+        starts: (S, D) world positions [m].
+        ends: (S, D) world positions [m].
+        mover: robot shape and hazard scale; None: a point.
+
+    Returns:
+        (S,) probabilities, differentiable.
+
+    Raises:
+        ValueError: see `segment_hazard`.
     """
     return torch.exp(-segment_hazard(model, starts, ends, mover))
 

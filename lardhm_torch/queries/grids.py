@@ -85,9 +85,19 @@ def grid_axes(lower: Any, upper: Any, resolution: float, device: Any = None) -> 
 
 
 def query_grid(model: Any, lower: Any, upper: Any, resolution: float) -> Tensor:
-    """Probability at all points of `grid`, without holding the points: (nx, ny, nz).
+    """Probability at all points of `grid`, without storing the points.
 
-    The result has the map's dtype and device.
+    Args:
+        model: a map.
+        lower: (D,) lower corner, world frame [m].
+        upper: (D,) upper corner, world frame [m].
+        resolution: distance of neighboring points [m].
+
+    Returns:
+        (nx, ny, nz) probabilities with the dtype and the device of the map.
+
+    Raises:
+        ValueError: see `grid`.
     """
     axes = grid_axes(lower, upper, resolution, model.origin.device)
     if len(axes) != model.dim:
@@ -126,7 +136,10 @@ def query_slice(
         model: the map.
         height: z of the plane [m]; None for a 2-D map.
         resolution: distance of neighboring points [m].
-        bounds: lower and upper (x, y) [m]; left out: those of the map.
+        bounds: lower and upper (x, y) [m]; None: those of the map.
+
+    Returns:
+        The axes and the probabilities of the slice.
 
     Raises:
         ValueError: height is missing for a 3-D map or given for a 2-D one; another dimension.

@@ -1,4 +1,4 @@
-"""Verbs that ask maps."""
+"""Subcommands that query maps."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+from lardhm_torch.cli.outputs import check_output
 from lardhm_torch.cli.scan_files import read_scans
 
-# torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
+# Imports of torch are inside the functions: `lardhm --help` must be fast.
+
+MAX_CELLS = 1 << 17  # along an axis of a grid or mesh: beyond it memory runs out
 
 
 def query(arguments: argparse.Namespace) -> None:
-    """Points to probabilities, in the order of the points."""
+    """Compute the probability of occupancy at points."""
     import numpy as np
     import torch
 
@@ -21,6 +24,7 @@ def query(arguments: argparse.Namespace) -> None:
     from lardhm_torch.io.scan_files import load_points
     from lardhm_torch.tiles.tiled_map import open_map
 
+    check_output(arguments.output, (".npy",), [arguments.map, arguments.points])
     model = open_map(arguments.map)
     points = load_points(arguments.points)
     if points.shape[1] == model.dim + 1 and bool((points[:, -1] == points[:1, -1]).all()):
@@ -33,13 +37,16 @@ def query(arguments: argparse.Namespace) -> None:
 
 
 def mesh(arguments: argparse.Namespace) -> None:
-    """A map to a surface."""
+    """Extract the surface of a map as a mesh."""
     from lardhm_torch import extract_mesh
-    from lardhm_torch.io.mesh_files import save_mesh
+    from lardhm_torch.io.mesh_files import MESH_SUFFIXES, save_mesh
     from lardhm_torch.tiles.tiled_map import open_map
 
+    check_output(arguments.output, MESH_SUFFIXES, [arguments.map])
+    model = open_map(arguments.map)
+    _check_resolution(model, arguments.resolution)
     surface = extract_mesh(
-        open_map(arguments.map),
+        model,
         arguments.resolution,
         arguments.threshold,
         surface=arguments.surface,
@@ -51,23 +58,31 @@ def mesh(arguments: argparse.Namespace) -> None:
 
 
 def grid(arguments: argparse.Namespace) -> None:
-    """A map to a grid of probabilities: .npz, or OctoMap's .bt and .ot."""
-    from lardhm_torch.io.grid_files import save_grid
+    """Write the probabilities of a map on a grid."""
+    from lardhm_torch.io.grid_files import GRID_SUFFIXES, save_grid
     from lardhm_torch.tiles.tiled_map import open_map
 
+    check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
     model = open_map(arguments.map)
+    _check_resolution(model, arguments.resolution)
     count = save_grid(model, arguments.output, arguments.resolution)
     print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 
 def view(arguments: argparse.Namespace) -> None:
-    """A map on a page for the browser, with its scans."""
+    """Show a map, and optionally its scans, in the browser."""
     import threading
 
     from lardhm_torch.tiles.tiled_map import open_map
-    from lardhm_torch.viewing.viewer import MapViewer, ViewConfig
+    from lardhm_torch.viewing.viewer import EXPORT_SUFFIXES, MapViewer, ViewConfig
 
+    if arguments.export is not None:
+        inputs = [arguments.map, *arguments.scans]
+        check_output(arguments.export, EXPORT_SUFFIXES, inputs, option="--export")
+    _check_address(arguments.host, arguments.port)
     model = open_map(arguments.map)
+    if arguments.resolution is not None:
+        _check_resolution(model, arguments.resolution)
     scans = read_scans(arguments, model.dim) if arguments.scans else None
     config = ViewConfig(host=arguments.host, port=arguments.port, resolution=arguments.resolution)
     viewer = MapViewer(model, scans, config)
@@ -76,21 +91,37 @@ def view(arguments: argparse.Namespace) -> None:
             viewer.export(arguments.export)
             print(f"{len(model)} clusters -> {arguments.export}")
             return
-        print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
+        print(f"{viewer.url}  (Ctrl-C stops it)", flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:
-        print("ended")
+        print("stopped")
     finally:
         viewer.close()
 
 
+def _check_address(host: str, port: int) -> None:
+    """Raise an error if no server can listen there; the server's own thread would report none."""
+    import socket
+
+    if not 0 < port < 1 << 16:
+        raise ValueError(f"--port must be 1 to 65535; got {port}")
+    try:
+        family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise OSError(f"--host must be an address of this machine; got {host}: {error}") from error
+
+
 def render(arguments: argparse.Namespace) -> None:
-    """A map to a picture, without a screen."""
+    """Draw a map to a picture; no display is needed."""
     from lardhm_torch import extract_mesh
     from lardhm_torch.tiles.tiled_map import open_map
     from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
+    check_output(arguments.output, (".png",), [arguments.map])
     model = open_map(arguments.map)
+    _check_resolution(model, arguments.resolution)
     if arguments.slice is not None or model.dim == 2:
         render_slice(model, arguments.output, arguments.slice, arguments.resolution)
         print(f"slice -> {arguments.output}")
@@ -109,11 +140,14 @@ def render(arguments: argparse.Namespace) -> None:
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """A map against held-out rays."""
+    """Evaluate a map on held-out rays."""
     from lardhm_torch.evaluation import held_out, scores
     from lardhm_torch.evaluation.calibration import draw_reliability
     from lardhm_torch.tiles.tiled_map import open_map
 
+    if arguments.reliability is not None:
+        inputs = [arguments.map, *arguments.scans]
+        check_output(arguments.reliability, (".png",), inputs, option="--reliability")
     model = open_map(arguments.map)
     scans = read_scans(arguments, model.dim)
     answers = held_out.answer_held_out(model, scans, seed=arguments.seed)
@@ -124,13 +158,30 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def info(arguments: argparse.Namespace) -> None:
-    """What a map file, or the folder of a tiled map, holds."""
+    """Print the settings and the contents of a map."""
     rows = (_info_of_folder if Path(arguments.map).is_dir() else _info_of_file)(arguments.map)
     if arguments.json:
         print(json.dumps(rows, indent=2))
         return
     for name, value in rows.items():
         print(f"{name:<22}{value}")
+
+
+def _check_resolution(model: Any, resolution: float) -> None:
+    """Raise a ValueError for a cell size that is not positive or would fill the memory."""
+    from lardhm_torch.queries.grids import map_bounds
+
+    if not 0 < resolution < float("inf"):
+        raise ValueError(f"--resolution must be > 0 m and finite; got {resolution}")
+    if len(model) == 0:
+        return
+    lower, upper = map_bounds(model)
+    extent = float((upper - lower).max())
+    if extent / resolution > MAX_CELLS:
+        raise ValueError(
+            f"--resolution must be at least {extent / MAX_CELLS:.2g} m for a map that spans "
+            f"{extent:.1f} m; got {resolution}"
+        )
 
 
 def _info_of_file(path: str) -> dict[str, Any]:
@@ -156,7 +207,7 @@ def _info_of_file(path: str) -> dict[str, Any]:
 
 
 def _info_of_folder(path: str) -> dict[str, Any]:
-    """From the manifest alone: the tiles stay closed."""
+    """Rows from the manifest alone; no tile is read."""
     from lardhm_torch.tiles.manifest import read_manifest
 
     manifest = read_manifest(path)
