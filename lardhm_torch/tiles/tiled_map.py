@@ -39,6 +39,10 @@ class TiledMap:
     of a map are those of the whole, if it fits the memory limit.
     """
 
+    weights: Tensor  # these three by `__getattr__`
+    centers: Tensor
+    scale_tril: Tensor
+
     def __init__(
         self,
         folder: str | os.PathLike[str],
