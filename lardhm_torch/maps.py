@@ -65,12 +65,14 @@ def to_tensor(values: TensorLike, name: str, device: torch.device | str | None =
     if isinstance(values, Tensor):
         return values.to(device or values.device, torch.float64)
     try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
+        array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "biuf":
         raise ValueError(
             f"{name} must be a tensor, an array or equally long lists of numbers; got {values!r}"
-        ) from error
-    return torch.from_numpy(array).to(device)
+        )
+    return torch.from_numpy(array.astype(np.float64)).to(device)
 
 
 # --- optional members ---

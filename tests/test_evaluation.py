@@ -282,7 +282,7 @@ def test_bad_scans_and_probabilities_are_refused():
         occupancy_metrics(fine, torch.zeros(0))
     with pytest.raises(ValueError, match=r"on_hits must be \(N,\).*got \(2, 2\)"):
         occupancy_metrics(fine.reshape(2, 2), fine)
-    with pytest.raises(ValueError, match=r"model must answer \(500,\).*got \[\(3,\)\]"):
+    with pytest.raises(ValueError, match=r"model must return \(500,\).*got \[\(3,\)\]"):
         evaluate(lambda points: torch.zeros(3), sphere_scan())
     with pytest.raises(ValueError, match="at least one row"):
         format_metrics({})

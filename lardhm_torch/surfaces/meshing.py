@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, pieces, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, log_odds_variance, pieces, to_tensor
 from lardhm_torch.queries.grids import (
     EVIDENCE,
     SURFACES,
@@ -88,6 +88,8 @@ def extract_mesh(
     for name, value, known in (("surface", surface, SURFACES), ("color", color, (*COLORS, None))):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {value!r}")
+    if color == "variance":
+        log_odds_variance(model, model.origin[None])  # raises now rather than after minutes
     lattice = surface_lattice(model, resolution, threshold, bounds, progress=progress)
     return lattice_mesh(model, lattice, threshold, surface=surface, color=color, evidence=evidence)
 
