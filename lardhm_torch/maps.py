@@ -2,7 +2,7 @@
 
 Every object with the members of `OccupancyMap` is a map: `LardHilbertMap`, `TiledMap`, or a class of
 your own. Some maps offer more, for speed or because they do not fit in memory. The functions below
-use these optional members where a map has them, and are the only place that asks for them.
+use these optional members where a map has them, and no other module checks for them.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def local_parts(
         upper: (N, D) upper corners [m].
 
     Yields:
-        indices of the boxes in a group, and the map to ask.
+        indices of the boxes in a group, and the map for them.
     """
     if hasattr(model, "local_parts"):
         yield from model.local_parts(lower, upper)

@@ -119,15 +119,18 @@ def answer_held_out(
     return HeldOut(*map(query, held_out_points(scans, seed)))
 
 
-def score_held_out(answers: HeldOut) -> dict[str, dict[str, float]]:
+def score_held_out(probabilities: HeldOut) -> dict[str, dict[str, float]]:
     """Scores for each kind of free point: unif, near, paper."""
-    return {kind: occupancy_metrics(answers.hits, getattr(answers, kind)) for kind in FREE_KINDS}
+    return {
+        kind: occupancy_metrics(probabilities.hits, getattr(probabilities, kind))
+        for kind in FREE_KINDS
+    }
 
 
-def reliability_held_out(answers: HeldOut) -> dict[str, Tensor]:
+def reliability_held_out(probabilities: HeldOut) -> dict[str, Tensor]:
     """Reliability diagram for each kind of free point; both classes have the same mass."""
     return {
-        kind: reliability(*both_classes(answers.hits, getattr(answers, kind)))
+        kind: reliability(*both_classes(probabilities.hits, getattr(probabilities, kind)))
         for kind in FREE_KINDS
     }
 

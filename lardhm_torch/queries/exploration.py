@@ -68,8 +68,8 @@ def frontiers(
     border = free & binary_dilation(~occupied & ~free)
     device = model.origin.device
     axes = grid_axes(lower, upper, resolution, device)
-    places = [torch.from_numpy(place).to(device) for place in border.nonzero()]
-    points = torch.stack([axis[place] for axis, place in zip(axes, places, strict=True)], dim=1)
+    indices = [torch.from_numpy(index).to(device) for index in border.nonzero()]
+    points = torch.stack([axis[index] for axis, index in zip(axes, indices, strict=True)], dim=1)
     return Frontiers(points, torch.from_numpy(_group_ranks(border)).to(device))
 
 

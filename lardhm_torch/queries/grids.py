@@ -20,8 +20,8 @@ from lardhm_torch.native import nearest_centers
 
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # half edge of a cluster's box; a kernel is exp(-3^2 / 2) = 1 % of its peak there
-EVIDENCE = 1.0  # log-odds beyond the threshold above which measurements stand behind an answer;
-# the tails of kernels around unmeasured space stay below it
+EVIDENCE = 1.0  # margin of log-odds beyond a threshold that counts as evidence of a measurement;
+# the tails of kernels in unmeasured space stay below it
 SURFACES = (
     "peak",
     "crossing",

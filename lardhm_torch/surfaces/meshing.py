@@ -85,9 +85,9 @@ def extract_mesh(
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
     _check_meshing(model, resolution, threshold, evidence)
-    for name, value, known in (("surface", surface, SURFACES), ("color", color, (*COLORS, None))):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, known))}; got {value!r}")
+    for name, value, allowed in (("surface", surface, SURFACES), ("color", color, (*COLORS, None))):
+        if value not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}; got {value!r}")
     if color == "variance":
         log_odds_variance(model, model.origin[None])  # raises now rather than after minutes
     lattice = surface_lattice(model, resolution, threshold, bounds, progress=progress)

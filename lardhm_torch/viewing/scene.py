@@ -96,20 +96,20 @@ def ellipsoids(model: OccupancyMap, chosen: Tensor, offset: np.ndarray) -> dict[
     }
 
 
-def fewer_faces(mesh: trimesh.Trimesh, most: int = SHOWN_FACES) -> trimesh.Trimesh:
-    """Simplify a mesh to about ``most`` faces; vertices get the color of the nearest old vertex.
+def fewer_faces(mesh: trimesh.Trimesh, limit: int = SHOWN_FACES) -> trimesh.Trimesh:
+    """Simplify a mesh to about ``limit`` faces; vertices get the color of the nearest old vertex.
 
     Source: Garland & Heckbert 1997, quadric error metrics (by fast-simplification).
     """
     import trimesh
     from scipy.spatial import cKDTree
 
-    if len(mesh.faces) <= most:
+    if len(mesh.faces) <= limit:
         return mesh
     import fast_simplification
 
     vertices, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float32), mesh.faces, target_count=most
+        mesh.vertices.astype(np.float32), mesh.faces, target_count=limit
     )
     nearest = cKDTree(mesh.vertices).query(vertices)[1]
     visual: Any = mesh.visual
@@ -143,26 +143,26 @@ def painted_glb(mesh: trimesh.Trimesh) -> bytes:
     return export_glb(trimesh.Scene(painted), include_normals=False, tree_postprocessor=unlit)
 
 
-def scan_points(scans: Scans, most: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) hits, at most about ``most``, and (N, 3) uint8 gray levels by height."""
+def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) hits, at most about ``limit``, and (N, 3) uint8 gray levels by height."""
     from matplotlib import colormaps
 
     hits = scans.hits
     hits = hits[hits.isfinite().all(dim=1)].cpu()
-    points = thinned((hits.numpy() - offset).astype(np.float32), most)
+    points = thinned((hits.numpy() - offset).astype(np.float32), limit)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
     return points, colormaps["gray"](shades, bytes=True)[:, :3]
 
 
-def thinned(points: np.ndarray, most: int) -> np.ndarray:
-    """At most ``most`` of (N, 3) points: the first in each voxel, with voxels as large as needed."""
+def thinned(points: np.ndarray, limit: int) -> np.ndarray:
+    """At most ``limit`` of (N, 3) points: the first in each voxel, with voxels as large as needed."""
     kept, edge = np.arange(len(points)), 0.01
-    while len(kept) > most:
+    while len(kept) > limit:
         cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
         sides = cells.max(axis=0) + 1
         kept = np.unique(np.ravel_multi_index(cells.T, sides), return_index=True)[1]
-        edge *= max(1.02, (len(kept) / most) ** 0.4)  # on surfaces the count goes with edge^-2
+        edge *= max(1.02, (len(kept) / limit) ** 0.4)  # on surfaces the count goes with edge^-2
     return points[np.sort(kept)]
 
 
@@ -262,9 +262,9 @@ class Stage:
                 visible=self._visible(name),
             )
 
-    def draw_scans(self, scans: Scans, most: int) -> int:
-        """Show the sensors and at most ``most`` points; returns the number of points shown."""
-        points, colors = scan_points(scans, most, self.offset)
+    def draw_scans(self, scans: Scans, limit: int) -> int:
+        """Show the sensors and at most ``limit`` points; returns the number of points shown."""
+        points, colors = scan_points(scans, limit, self.offset)
         scene = self.server.scene
         scene.add_point_cloud("/scans", points, colors, point_size=0.02, precision="float32")
         origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
