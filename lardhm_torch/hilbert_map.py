@@ -16,6 +16,7 @@ from lardhm_torch.learning import map_merging, parameters, posterior
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
+from lardhm_torch.maps import TensorLike
 from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame, training_points
 from lardhm_torch.sampling import seeded_generator
 
@@ -53,15 +54,15 @@ class LardHilbertMap(parameters.MapParameters):
 
     # --- queries ---
 
-    def forward(self, points: Tensor) -> Tensor:
+    def forward(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
         return self._query(points, probability=True)
 
-    def log_odds(self, points: Tensor) -> Tensor:
+    def log_odds(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
         return self._query(points, probability=False)
 
-    def features(self, points: Tensor) -> Tensor:
+    def features(self, points: TensorLike) -> Tensor:
         """(N, D) world positions [m] -> sparse COO (N, M), K kernel values a row, eq. (9)."""
         local = self._to_map_frame(points)
         if local.ndim != 2:
@@ -72,7 +73,7 @@ class LardHilbertMap(parameters.MapParameters):
         values = lard_kernel(local, self.centers, self.scale_tril, indices)
         return feature_matrix(indices, values, len(self))
 
-    def variance(self, points: Tensor) -> Tensor:
+    def variance(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) variance of the log-odds; the prior's where unseen.
 
         Raises:
@@ -80,7 +81,7 @@ class LardHilbertMap(parameters.MapParameters):
         """
         return self._posterior(points)[1]
 
-    def bayesian_probability(self, points: Tensor) -> Tensor:
+    def bayesian_probability(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability that accounts for the weights' variance.
 
         Raises:
@@ -127,7 +128,7 @@ class LardHilbertMap(parameters.MapParameters):
         tensors = (self.centers, self.raw_scale_tril, self.weights)
         return native.raycast(rays, march, tensors, self.kernel, self._fresh_index())
 
-    def _query(self, points: Tensor, probability: bool) -> Tensor:
+    def _query(self, points: TensorLike, probability: bool) -> Tensor:
         local = self._to_map_frame(points)
         flat = local.reshape(-1, self.dim)
         answer = native.occupancy(
@@ -138,7 +139,7 @@ class LardHilbertMap(parameters.MapParameters):
     def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
         return self.centers, self.raw_scale_tril, self.weights, self.kernel
 
-    def _posterior(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def _posterior(self, points: TensorLike) -> tuple[Tensor, Tensor]:
         """Mean and variance of the log-odds at (..., D) points."""
         if not bool((self.posterior_variances > 0).all()) or len(self) == 0:
             raise RuntimeError(
@@ -168,8 +169,8 @@ class LardHilbertMap(parameters.MapParameters):
                 self._index = native.build_index(self.centers, self.num_neighbors)
         return self._index
 
-    def _to_map_frame(self, points: Tensor) -> Tensor:
-        points = as_tensor(points, self.origin.device)
+    def _to_map_frame(self, points: TensorLike) -> Tensor:
+        points = as_tensor(points, "points", self.origin.device)
         check_points(points, self.dim)
         return to_map_frame(points, self.origin, self.centers.dtype)
 
@@ -177,8 +178,8 @@ class LardHilbertMap(parameters.MapParameters):
 
     def fit(
         self,
-        points: Tensor,
-        labels: Tensor,
+        points: TensorLike,
+        labels: TensorLike,
         num_clusters: int | None = None,
         *,
         seed: int = 0,
@@ -218,7 +219,7 @@ class LardHilbertMap(parameters.MapParameters):
         return self
 
     @torch.no_grad()
-    def fit_uncertainty(self, points: Tensor, labels: Tensor) -> LardHilbertMap:
+    def fit_uncertainty(self, points: TensorLike, labels: TensorLike) -> LardHilbertMap:
         """Estimate the variance of the weights, for `variance` and `bayesian_probability`.
 
         Probability and log-odds stay as they are, and as fast. Call it after the last `fit`,
@@ -244,8 +245,8 @@ class LardHilbertMap(parameters.MapParameters):
 
     def update(
         self,
-        points: Tensor,
-        labels: Tensor,
+        points: TensorLike,
+        labels: TensorLike,
         num_clusters: int | None = None,
         *,
         seed: int = 0,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
+from lardhm_torch.maps import TensorLike, to_tensor
 
 CHECK_CHUNK = 1 << 18  # labels checked at a time, so that the check needs little memory
 FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
@@ -24,7 +25,7 @@ class TrainingPoints(NamedTuple):
 
 
 def training_points(
-    points: Tensor, labels: Tensor, like: Tensor, origin: Tensor | None = None
+    points: TensorLike, labels: TensorLike, like: Tensor, origin: Tensor | None = None
 ) -> TrainingPoints:
     """Checked samples in a map's frame and dtype; in Morton order where the frame is new.
 
@@ -49,14 +50,17 @@ def training_points(
 
 
 def check_samples(
-    points: Tensor, labels: Tensor, dim: int, device: torch.device
+    points: TensorLike, labels: TensorLike, dim: int, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """Samples as (N, D) points and (N,) labels on a device; arrays and lists are converted.
 
     Raises:
         ValueError: wrong shapes, no points, NaN or infinite points, or labels not 0 or 1.
     """
-    points, labels = as_tensor(points, device).detach(), as_tensor(labels, device).detach()
+    points, labels = (
+        as_tensor(values, name, device).detach()
+        for name, values in (("points", points), ("labels", labels))
+    )
     if points.ndim != 2 or points.shape[1] != dim:
         raise ValueError(f"points must be (N, {dim}); got {tuple(points.shape)}")
     if labels.shape != points.shape[:1]:
@@ -109,11 +113,15 @@ def morton_order(points: Tensor) -> Tensor:
     return code.argsort(stable=True)
 
 
-def as_tensor(values: Any, device: torch.device) -> Tensor:
-    """A tensor, array or list as a tensor on the device; Python numbers become float64."""
-    if not isinstance(values, (Tensor, np.ndarray)):
-        values = np.asarray(values)
-    return torch.as_tensor(values, device=device)
+def as_tensor(values: TensorLike, name: str, device: torch.device) -> Tensor:
+    """A tensor or array on the device, of its own dtype; lists become float64.
+
+    Raises:
+        ValueError: values are not numbers, or nested lists differ in length.
+    """
+    if isinstance(values, (Tensor, np.ndarray)):
+        return torch.as_tensor(values, device=device)
+    return to_tensor(values, name, device)
 
 
 def check_points(points: Tensor, dim: int) -> None:

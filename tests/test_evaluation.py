@@ -240,6 +240,27 @@ def test_evaluate_in_chunks_equals_evaluate_at_once(monkeypatch):
     assert evaluate(model, scans) == whole
 
 
+def test_arrays_are_taken_like_tensors():
+    scans = sphere_scan()
+
+    def model(points: torch.Tensor) -> torch.Tensor:
+        return torch.sigmoid(torch.linalg.vector_norm(points, dim=1) - 8)
+
+    assert evaluate(lambda points: model(points).numpy(), scans) == evaluate(model, scans)
+    on_hits, on_free = random_probabilities(0)
+    expected = occupancy_metrics(on_hits, on_free)
+    assert occupancy_metrics(on_hits.tolist(), on_free.numpy()) == expected
+    with pytest.raises(
+        ValueError, match="on_free must be a tensor, an array or equally long lists"
+    ):
+        occupancy_metrics(on_hits, "often")
+    distances = [
+        mesh_metrics(box(), box(), h, num_points=100)
+        for h in (square_hits(), square_hits().numpy())
+    ]
+    assert distances[0] == distances[1]
+
+
 def test_the_table_has_a_row_for_each_kind_of_point():
     table = evaluate(lambda points: torch.full((len(points),), 0.5), sphere_scan())
     lines = format_metrics(table).splitlines()
@@ -261,7 +282,7 @@ def test_bad_scans_and_probabilities_are_refused():
         occupancy_metrics(fine, torch.zeros(0))
     with pytest.raises(ValueError, match=r"on_hits must be \(N,\).*got \(2, 2\)"):
         occupancy_metrics(fine.reshape(2, 2), fine)
-    with pytest.raises(ValueError, match=r"model must answer \(500,\).*got \[\(3,\)\]"):
+    with pytest.raises(ValueError, match=r"model must return \(500,\).*got \[\(3,\)\]"):
         evaluate(lambda points: torch.zeros(3), sphere_scan())
     with pytest.raises(ValueError, match="at least one row"):
         format_metrics({})

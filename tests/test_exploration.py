@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from small_maps import GaussianMap, ball
@@ -66,6 +67,30 @@ def test_nothing_is_gained_behind_a_wall_or_where_all_is_known():
     assert information_gain(model, start, toward, 8.0) == pytest.approx(before, abs=1e-2)
     known = GaussianMap(torch.zeros(1, 3), 5 * torch.eye(3)[None], [-30.0])
     assert information_gain(known, start, toward, 2.0) < 1e-6
+
+
+def test_a_long_winding_frontier_is_one_group_and_found_at_once():
+    class Serpentine(GaussianMap):
+        """Free on a path that winds through a square of 8 m, unknown beside it."""
+
+        def log_odds(self, points):
+            column, row = (points / 0.1).round().long().unbind(dim=-1)
+            turn = torch.where((row // 4) % 2 == 0, column == 79, column == 0)
+            free = ((row % 4 == 0) | turn) & (row <= 76)
+            return torch.where(free, -6.0, 0.0).double()
+
+    model = Serpentine(torch.zeros(1, 2), torch.eye(2)[None], [1.0])
+    found = frontiers(model, [0.0, 0.0], [7.9, 7.9], 0.1)
+    assert len(found.points) > 1500
+    assert (found.groups == 0).all()
+
+
+def test_arrays_and_lists_are_taken_like_tensors():
+    start, toward = np.array([-2.0, 0.0, 0.0]), [[1.0, 0.0, 0.0]]
+    gain = information_gain(open_box(), start, toward, 3.0)
+    assert gain == information_gain(open_box(), torch.tensor(start), torch.tensor(toward), 3.0)
+    found = frontiers(open_box(), np.full(3, -1.5), torch.full((3,), 1.5), 0.25)
+    assert torch.equal(found.points, frontiers(open_box(), [-1.5] * 3, [1.5] * 3, 0.25).points)
 
 
 def test_bad_views_are_refused():

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -36,6 +37,22 @@ def test_neighbors_in_a_grid_are_one_resolution_apart_and_none_lies_outside(
         assert along.min() == lower[axis]
         assert upper[axis] - resolution < along.max() + 1e-5
         assert along.max() <= upper[axis] + 1e-5
+
+
+def test_arrays_lists_and_tensors_are_corners_alike():
+    model = random_map(seed=1)
+    ends = (np.array([-1.0, -2.0, 0.0]), np.array([1.0, 2.0, 0.5]))
+    expected = query_grid(model, *(end.tolist() for end in ends), 0.5)
+    for convert in (np.asarray, torch.as_tensor, tuple):
+        assert torch.equal(query_grid(model, *map(convert, ends), 0.5), expected)
+        cut = query_slice(model, 0.5, 0.5, tuple(map(convert, ends)))
+        assert torch.equal(cut.probability, expected[:, :, -1])
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    assert torch.equal(
+        occupancy_gradient(model, points), occupancy_gradient(model, torch.tensor(points))
+    )
+    with pytest.raises(ValueError, match="lower must be a tensor, an array or equally long lists"):
+        grid("ab", [1, 1], 0.1)
 
 
 def test_the_query_grid_of_the_paper_has_its_number_of_points():

@@ -136,6 +136,13 @@ def test_bounds_cut_the_mesh():
     assert half.area == pytest.approx(whole.area / 2, rel=0.02)
 
 
+def test_bounds_may_be_arrays():
+    corners = ([0, -1, -1], [1, 1, 1])
+    expected = level_mesh(ball_in_free_space(), 0.1, bounds=corners)
+    found = level_mesh(ball_in_free_space(), 0.1, bounds=tuple(map(np.array, corners)))
+    np.testing.assert_array_equal(found.vertices, expected.vertices)
+
+
 def test_bounds_away_from_every_obstacle_give_a_mesh_without_faces():
     mesh = level_mesh(ball(), 0.05, bounds=([10, 10, 10], [11, 11, 11]))
     assert isinstance(mesh, trimesh.Trimesh)
@@ -216,6 +223,7 @@ def test_without_color_the_mesh_has_none():
         ({"resolution": math.nan}, "resolution must be > 0 m and finite; got nan"),
         ({"threshold": 0.0}, "threshold must be between 0 and 1, both excluded; got 0.0"),
         ({"color": "pink"}, "color must be one of height, cluster, probability, variance, None"),
+        ({"color": "variance"}, "model must have a variance; GaussianMap has none"),
         ({"evidence": -1.0}, "evidence must be >= 0, or None"),
         ({"bounds": ([1, 1, 1], [0, 0, 0])}, "lower <= upper"),
         ({"bounds": ([0, 0], [1, 1])}, r"bounds must have 3 coordinates; got 2"),

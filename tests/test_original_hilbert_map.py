@@ -3,7 +3,7 @@ import torch
 from test_gaussian_process import wall
 
 from lardhm_torch.evaluation.baselines.original_hilbert_map import (
-    REACH,
+    SUPPORT_RADIUS,
     KernelApproximationMap,
     OriginalHilbertMap,
 )
@@ -29,7 +29,7 @@ def test_features_are_the_kernel_at_all_nodes_in_reach():
     dense.scatter_(1, index.long(), values)
     distances = torch.cdist(points, nodes(model)) / 0.2
     expected = torch.exp(-0.5 * distances**2)
-    inner = distances < REACH - 1  # of the nearest node, which is at most sqrt(3) / 2 away
+    inner = distances < SUPPORT_RADIUS - 1  # of the nearest node, which is at most sqrt(3) / 2 away
     torch.testing.assert_close(dense[inner], expected[inner])
     assert ((dense == 0) | (dense - expected).abs().lt(1e-12)).all()
 

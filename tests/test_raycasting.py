@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from small_maps import GaussianMap, ball, radius_where, random_map
@@ -62,31 +63,62 @@ def test_ranges_do_not_depend_on_how_rays_are_batched(monkeypatch):
         together = raycast(model, starts, directions, 5.0, surface=surface)
         assert together.isfinite().any()
         with monkeypatch.context() as smaller:
-            smaller.setattr(raycasting, "RAYS_AT_ONCE", 3)
-            smaller.setattr(raycasting, "BLOCK_POINTS", 2 * raycasting.STRIDE)
-            smaller.setattr(raycasting, "WINDOW", 4)
+            smaller.setattr(raycasting, "BLOCK_POINTS", 100)
             apart = raycast(model, starts, directions, 5.0, surface=surface)
         torch.testing.assert_close(apart, together)
 
 
+def naive_range(model, start, direction, max_range, level, step, surface):
+    """One ray, step by step, as the docstring of `raycast` says, without any refinement."""
+    below = best = found = None
+    for number in range(math.ceil(max_range / step - 1e-9) + 1):
+        depth = min(number * step, max_range)
+        value = float(model.log_odds(start + depth * direction))
+        if found is None and value <= level:
+            below = depth
+        if found is None and value > level + EVIDENCE:
+            found, best = depth, -math.inf
+        if found is not None:
+            if value < best - EVIDENCE:
+                break
+            if value > best:
+                peak, best = depth, value
+    if found is None:
+        return math.inf
+    return peak if surface == "peak" else below
+
+
 @pytest.mark.parametrize("surface", raycasting.SURFACES)
 @pytest.mark.parametrize("dim", [1, 2, 3])
-def test_skipping_empty_space_changes_no_range(dim, surface, monkeypatch):
+def test_ranges_are_within_a_step_of_a_loop_over_steps(dim, surface):
     rng = torch.Generator().manual_seed(dim)
-    model = random_map(seed=dim, dim=dim, clusters=12)
-    starts = 4 * torch.randn(300, dim, generator=rng, dtype=torch.float64)
-    directions = torch.randn(300, dim, generator=rng, dtype=torch.float64)
+    model = random_map(seed=dim, dim=dim, clusters=12 * dim)
+    starts = 3 * torch.randn(100, dim, generator=rng, dtype=torch.float64)
+    directions = torch.randn(100, dim, generator=rng, dtype=torch.float64) - starts
     directions[0, 1:] = 0  # along an axis
-    plain = raycast(model, starts, directions, 9.0, 0.6, 0.05, surface=surface)
-    assert plain.isfinite().any()
-    assert plain.isinf().any()
-    monkeypatch.setattr(raycasting, "SKIP_FROM", 0)
-    made = []
-    find = raycasting._empty_space
-    monkeypatch.setattr(raycasting, "_empty_space", lambda *a: made.append(find(*a)) or made[-1])
-    skipping = raycast(model, starts, directions, 9.0, 0.6, 0.05, surface=surface)
-    assert not made[0].occupied.all()
-    torch.testing.assert_close(skipping, plain)
+    directions /= directions.norm(dim=1, keepdim=True)
+    level, step = math.log(0.6 / 0.4), 0.05
+    ranges = raycast(model, starts, directions, 9.0, 0.6, step, surface=surface).tolist()
+    naive = [
+        naive_range(model, start, direction, 9.0, level, step, surface)
+        for start, direction in zip(starts, directions, strict=True)
+    ]
+    assert [math.isinf(r) for r in ranges] == [n == math.inf for n in naive]
+    known = [(r, n) for r, n in zip(ranges, naive, strict=True) if n not in (None, math.inf)]
+    assert len(known) > 5
+    if surface == "peak":
+        assert all(abs(r - n) <= 1.25 * step for r, n in known)
+    else:  # between the last step below and the next one, unless it began above
+        assert all(n <= r <= n + 2 * step for r, n in known)
+
+
+def test_arrays_and_lists_are_taken_like_tensors():
+    start, toward = [-2.0, 0.0, 0.0], np.array([[1.0, 0, 0], [1.0, 0.1, 0]])
+    expected = raycast(ball(), torch.tensor(start), torch.tensor(toward), 5.0)
+    assert torch.equal(raycast(ball(), start, toward, 5.0), expected)
+    assert torch.equal(raycast(ball(), np.array(start), toward.tolist(), 5.0), expected)
+    with pytest.raises(ValueError, match="directions must be a tensor, an array or equally long"):
+        raycast(ball(), start, [[1.0, 0.0, 0.0], [1.0]], 5.0)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.13, -0.2])

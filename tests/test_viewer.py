@@ -11,6 +11,7 @@ from chromium import chromium, chromium_path
 from scipy.spatial import cKDTree
 
 from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, simulate_room
+from lardhm_torch.surfaces import vertex_colors
 from lardhm_torch.viewing import scene
 from lardhm_torch.viewing.viewer import LiveView, MapViewer, ViewConfig
 
@@ -215,7 +216,7 @@ def test_cells_are_small_where_surfaces_are_thin_but_not_too_many():
     thick, thin, thinner = (scene.view_resolution(flat_map(t)) for t in (1.0, 0.18, 0.001))
     assert thin == pytest.approx(scene.SHEET_CELLS * 0.18, rel=0.03)
     assert thick > thin > thinner
-    assert thick / thinner == pytest.approx((scene.MOST_FACES / scene.MESH_FACES) ** 0.5)
+    assert thick / thinner == pytest.approx((scene.MAX_MESH_FACES / scene.MESH_FACES) ** 0.5)
 
 
 def test_painted_light_is_brighter_on_what_faces_it():
@@ -249,12 +250,14 @@ class UnsureMap(LardHilbertMap):
 def test_variance_is_offered_where_the_map_knows_it_and_colors_grow_with_it():
     unsure = UnsureMap()
     unsure.load_state_dict(LardHilbertMap().fit(torch.rand(50, 3), torch.ones(50), 3).state_dict())
-    assert scene.knows_variance(unsure)
-    colors = scene.variance_colors(unsure, np.array([[0, 0, z] for z in (0.01, 0.1, 1.0, 10.0)]))
+    assert vertex_colors.has_variance(unsure)
+    colors = vertex_colors.variance_colors(
+        unsure, np.array([[0, 0, z] for z in (0.01, 0.1, 1.0, 10.0)])
+    )
     assert (np.diff(colors[:, :3].astype(int).sum(axis=1)) > 0).all()
     unsure.ready = False
-    assert not scene.knows_variance(unsure)
-    assert not scene.knows_variance(LardHilbertMap())
+    assert not vertex_colors.has_variance(unsure)
+    assert not vertex_colors.has_variance(LardHilbertMap())
 
 
 def test_ellipsoids_are_turned_as_their_clusters_are():
@@ -272,7 +275,6 @@ def test_ellipsoids_are_turned_as_their_clusters_are():
     [
         ({"resolution": 0.0}, "resolution must be > 0 m; got 0.0"),
         ({"max_points": 0}, "max_points must be 1 or more; got 0"),
-        ({"max_clusters": 0}, "max_clusters must be 1 or more; got 0"),
     ],
 )
 def test_bad_settings_are_refused(settings, message):

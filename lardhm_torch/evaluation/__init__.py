@@ -1,1 +1,1 @@
-"""How good a map is, and the methods that it is compared with."""
+"""Evaluation of maps on held-out rays and true surfaces, and the baselines for comparison."""

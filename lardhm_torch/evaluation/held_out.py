@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,19 +13,19 @@ from lardhm_torch.evaluation.calibration import reliability
 from lardhm_torch.evaluation.scores import both_classes, occupancy_metrics
 from lardhm_torch.scans import Scans
 
-MIN_RANGE, MAX_RANGE = 0.3, 60.0  # [m] rays outside are not test rays
-NEAR_START, NEAR_END = 0.6, 0.2  # [m] before the hit: where the near points lie
+MIN_RANGE, MAX_RANGE = 0.3, 60.0  # [m] other rays are neither training nor test rays
+NEAR_START, NEAR_END = 0.6, 0.2  # [m] before the hit, between which near points lie
 FREE_KINDS = ("unif", "near", "paper")
-PAPER_SHARE = 0.95  # of a ray: where the paper's own free test points lie
-QUERY_POINTS = 1 << 20  # points asked at a time
+PAPER_FRACTION = 0.95  # of a ray, on which the free test points of the paper lie
+QUERY_POINTS = 1 << 20  # points queried at a time
 
 
 class HeldOut(NamedTuple):
-    """Test points of R rays, world frame, each (R, D) float64 [m].
+    """Test points of R rays, each (R, D) float64 in the world frame [m]; or values at them.
 
     ``hits`` are occupied, all others free: ``unif`` uniform from the sensor to 0.2 m before the
-    hit, ``near`` between 0.6 m and 0.2 m before it, ``paper`` uniform over 95 % of the ray, with
-    no margin (the paper's own kind of test).
+    hit, ``near`` between 0.6 m and 0.2 m before it, ``paper`` uniform over the first 95 % of the
+    ray, as in the paper.
     """
 
     hits: Tensor
@@ -34,12 +35,15 @@ class HeldOut(NamedTuple):
 
 
 def protocol_rays(scans: Scans, max_rays: int | None = None, seed: int = 0) -> Scans:
-    """The rays that train and test: returns, first of their pulse, 0.3 m < range < 60 m.
+    """The rays used for training and testing: first returns with 0.3 m < range < 60 m.
 
     Args:
         scans: range scans.
-        max_rays: a random subset of this size where there are more; None: all.
-        seed: of the subset.
+        max_rays: draw a random subset of this size if there are more; None: keep all.
+        seed: random seed of the subset.
+
+    Returns:
+        the selected rays, in their order.
     """
     ranges = scans.ranges
     usable = (ranges > MIN_RANGE) & (ranges < MAX_RANGE) & scans.is_return
@@ -53,6 +57,10 @@ def protocol_rays(scans: Scans, max_rays: int | None = None, seed: int = 0) -> S
 
 def held_out_points(scans: Scans, seed: int = 0) -> HeldOut:
     """Test points of every usable ray: its hit and three free points before it.
+
+    Args:
+        scans: range scans.
+        seed: random seed of the free points.
 
     Raises:
         ValueError: no ray is usable (see `protocol_rays`).
@@ -68,71 +76,82 @@ def held_out_points(scans: Scans, seed: int = 0) -> HeldOut:
     rng = torch.Generator(device=ranges.device).manual_seed(seed)
 
     def uniform(start: Tensor, end: Tensor) -> Tensor:
-        share = torch.rand(ranges.shape, generator=rng, device=ranges.device, dtype=ranges.dtype)
-        return origins + (start + share * (end - start)) * directions
+        fraction = torch.rand(ranges.shape, generator=rng, device=ranges.device, dtype=ranges.dtype)
+        return origins + (start + fraction * (end - start)) * directions
 
     zero, margin = torch.zeros_like(ranges), ranges - NEAR_END
     return HeldOut(
         hits=rays.ends,
         unif=uniform(zero, margin),
         near=uniform((ranges - NEAR_START).clamp(min=0), margin),
-        paper=uniform(zero, PAPER_SHARE * ranges),
+        paper=uniform(zero, PAPER_FRACTION * ranges),
     )
 
 
 @torch.no_grad()
-def answer_held_out(model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0) -> HeldOut:
-    """Probabilities of a map at the test points of held-out rays, each (R,).
+def answer_held_out(
+    model: Callable[[Tensor], Tensor | np.ndarray], scans: Scans, seed: int = 0
+) -> HeldOut:
+    """Probabilities of a map at the test points of held-out rays.
 
     Args:
-        model: (N, D) world positions -> (N,) probability of occupancy.
-        scans: rays that the map has not seen.
-        seed: of the test points.
+        model: a map, a baseline, or any function (N, D) world positions -> (N,) probability of
+            occupancy, as a tensor or an array.
+        scans: rays that were not used for training.
+        seed: random seed of the test points.
+
+    Returns:
+        (R,) probabilities for each kind of test point.
 
     Raises:
-        ValueError: no ray is usable, or the model answers with anything but (N,) probabilities.
+        ValueError: no ray is usable, or the model does not return one probability per point.
     """
 
-    def ask(positions: Tensor) -> Tensor:
-        answers = [model(chunk) for chunk in positions.split(QUERY_POINTS)]
-        if sum(len(answer) for answer in answers) != len(positions):
+    def query(positions: Tensor) -> Tensor:
+        chunks = [torch.as_tensor(model(chunk)) for chunk in positions.split(QUERY_POINTS)]
+        if sum(len(chunk) for chunk in chunks) != len(positions):
             raise ValueError(
-                f"model must answer ({len(positions)},), one probability per point; "
-                f"got {[tuple(answer.shape) for answer in answers]}"
+                f"model must return ({len(positions)},), one probability per point; "
+                f"got {[tuple(chunk.shape) for chunk in chunks]}"
             )
-        return torch.cat(answers)
+        return torch.cat(chunks)
 
-    return HeldOut(*map(ask, held_out_points(scans, seed)))
+    return HeldOut(*map(query, held_out_points(scans, seed)))
 
 
-def score_held_out(answers: HeldOut) -> dict[str, dict[str, float]]:
+def score_held_out(probabilities: HeldOut) -> dict[str, dict[str, float]]:
     """Scores for each kind of free point: unif, near, paper."""
-    return {kind: occupancy_metrics(answers.hits, getattr(answers, kind)) for kind in FREE_KINDS}
-
-
-def reliability_held_out(answers: HeldOut) -> dict[str, Tensor]:
-    """Reliability diagram for each kind of free point, both classes of the same mass."""
     return {
-        kind: reliability(*both_classes(answers.hits, getattr(answers, kind)))
+        kind: occupancy_metrics(probabilities.hits, getattr(probabilities, kind))
+        for kind in FREE_KINDS
+    }
+
+
+def reliability_held_out(probabilities: HeldOut) -> dict[str, Tensor]:
+    """Reliability diagram for each kind of free point; both classes have the same mass."""
+    return {
+        kind: reliability(*both_classes(probabilities.hits, getattr(probabilities, kind)))
         for kind in FREE_KINDS
     }
 
 
 def evaluate(
-    model: Callable[[Tensor], Tensor], scans: Scans, seed: int = 0
+    model: Callable[[Tensor], Tensor | np.ndarray], scans: Scans, seed: int = 0
 ) -> dict[str, dict[str, float]]:
     """Evaluate a map on held-out rays.
 
     Args:
-        model: (N, D) world positions [m] -> (N,) probability of occupancy.
-        scans: rays that were not used for training.
+        model: a map, a baseline, or any function (N, D) world positions [m] -> (N,) probability of
+            occupancy, as a tensor or an array.
+        scans: rays that were not used for training; those outside of 0.3 m to 60 m, later returns
+            and no-returns are ignored.
         seed: random seed of the test points.
 
     Returns:
-        For each kind of free point (``unif``, ``near``, ``paper``) the scores of
-        `scores.occupancy_metrics` by name.
+        for each kind of free point ("unif", "near", "paper", see `HeldOut`) a dictionary of scores,
+        see `occupancy_metrics`.
 
     Raises:
-        ValueError: no ray is usable, or the model does not return (N,) probabilities.
+        ValueError: no ray is usable, or the model does not return one probability per point.
     """
     return score_held_out(answer_held_out(model, scans, seed))

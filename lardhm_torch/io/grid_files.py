@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lardhm_torch.evaluation.baselines.octomap import new_tree, to_array
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.maps import OccupancyMap, TensorLike
 from lardhm_torch.queries.grids import (
     BLOCK_POINTS,
     EVIDENCE,
@@ -28,10 +29,10 @@ _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zer
 
 
 def save_grid(
-    model: Any,
+    model: OccupancyMap,
     path: str | os.PathLike[str],
     resolution: float = 0.1,
-    bounds: tuple[Any, Any] | None = None,
+    bounds: tuple[TensorLike, TensorLike] | None = None,
 ) -> int:
     """Write the map as a grid of cells, in the format of the extension.
 
@@ -89,7 +90,9 @@ def save_grid(
     return count
 
 
-def _octomap_of(model: Any, first: Tensor, last: Tensor, resolution: float) -> tuple[Any, int]:
+def _octomap_of(
+    model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
+) -> tuple[Any, int]:
     """An OctoMap tree of the known cells between two centers, and their number."""
     if model.dim != 3:
         raise ValueError(f"an OctoMap needs a 3-D map; got {model.dim}-D. Use .npz")
@@ -111,7 +114,7 @@ def _octomap_of(model: Any, first: Tensor, last: Tensor, resolution: float) -> t
 
 @torch.no_grad()
 def _known_cells(
-    model: Any, first: Tensor, last: Tensor, resolution: float
+    model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Centers (n, 3) and log-odds (n,) of the known cells, some blocks that hold clusters a time."""
     lower, upper = (box.cpu() for box in cluster_boxes(model))

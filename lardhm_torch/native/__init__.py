@@ -124,7 +124,7 @@ def raycast(
     kernel: Kernel,
     index: Tensor,
 ) -> Tensor:
-    """As `rays.raycast`, for a map that `supports` says yes to.
+    """As `raycasting.raycast`, for a map that `supports` says yes to.
 
     Args:
         rays: (R, D) origins in the map's frame and (R, D) directions of length 1, float64 [m].

@@ -1,1 +1,1 @@
-"""What a robot asks of a map: probabilities, ranges, collisions, where to look next."""
+"""Queries of a map: grids, ray casting, collision probabilities and exploration."""

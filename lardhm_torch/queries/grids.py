@@ -1,30 +1,38 @@
-"""Questions to a map at points: lattices, slices, bounds, gradients.
-
-A map is anything with the members of `LardHilbertMap` that are used here: ``log_odds(points)``,
-``centers``, ``scale_tril``, ``weights``, ``origin`` and ``dim``. One that is too large to have these
-tensors in one piece, a `tiles.TiledMap`, has ``pieces()`` and ``local_parts(lower, upper)``.
-"""
+"""Probabilities on grids and slices, bounds of a map, and its nearest clusters."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lardhm_torch.maps import (
+    OccupancyMap,
+    TensorLike,
+    local_parts,
+    native_lattice,
+    pieces,
+    to_tensor,
+)
 from lardhm_torch.native import nearest_centers
 
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
-NUM_STDS = 3.0  # how far a cluster reaches: exp(-3² / 2) = 1 % of its peak
-EVIDENCE = 1.0  # log-odds beyond the threshold that something measured reaches; ripple does not
-SURFACES = ("peak", "crossing")  # where a surface lies: on the ridge of log-odds, or at a level
+NUM_STDS = 3.0  # half edge of a cluster's box; a kernel is exp(-3^2 / 2) = 1 % of its peak there
+EVIDENCE = 1.0  # margin of log-odds beyond a threshold that counts as evidence of a measurement;
+# the tails of kernels in unmeasured space stay below it
+SURFACES = (
+    "peak",
+    "crossing",
+)  # a surface lies on the ridge of the log-odds, or at a level of them
 
 
 class Support(NamedTuple):
-    """Of N points: center (N, D) float64 world [m] of the nearest supporting cluster, and its
-    smallest standard deviation (N,) float64 [m]; NaN and 0 where nothing supports.
+    """Nearest cluster of one class for each of N points.
+
+    ``centers`` (N, D) float64 world positions [m] and ``thickness`` (N,) float64, the smallest
+    standard deviation of the kernel [m]; NaN and 0 where there is no such cluster.
     """
 
     centers: Tensor
@@ -34,25 +42,32 @@ class Support(NamedTuple):
 class Slice(NamedTuple):
     """A horizontal cut through a map.
 
-    ``probability`` is (nx, ny); ``extent`` is (x_first, x_last, y_first, y_last) of its lattice [m].
+    ``probability`` (nx, ny), and ``extent`` (x_first, x_last, y_first, y_last) of its points [m].
     """
 
     probability: Tensor
     extent: tuple[float, float, float, float]
 
 
-def grid(lower: Any, upper: Any, resolution: float, device: Any = None) -> Tensor:
-    """All points of a lattice that starts at ``lower`` and goes up to ``upper`` or just below it.
+def grid(
+    lower: TensorLike,
+    upper: TensorLike,
+    resolution: float,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """All points of a regular grid from ``lower`` to ``upper``.
+
+    The last point of an axis is ``upper`` if the edge is a multiple of the resolution, and less
+    than one resolution below it otherwise.
 
     Args:
-        lower: D coordinates of the first point, world frame [m].
-        upper: D coordinates of the far corner [m]; it is a lattice point if the edges are multiples
-            of the resolution.
-        resolution: distance of neighboring points [m].
-        device: of the result; left out: that of ``lower`` if it is a tensor, else the CPU.
+        lower: (D,) first point, world frame [m].
+        upper: (D,) far corner [m].
+        resolution: distance between neighboring points [m].
+        device: of the result; None: that of ``lower`` if it is a tensor, else the CPU.
 
     Returns:
-        (nx, ny, nz, D) float64 positions [m] (in two dimensions (nx, ny, D), and so on).
+        (n1, ..., nD, D) float64 positions [m].
 
     Raises:
         ValueError: the corners are not finite, ordered and of one length, or resolution is not > 0.
@@ -64,10 +79,15 @@ def grid(lower: Any, upper: Any, resolution: float, device: Any = None) -> Tenso
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
 
-def grid_axes(lower: Any, upper: Any, resolution: float, device: Any = None) -> list[Tensor]:
+def grid_axes(
+    lower: TensorLike,
+    upper: TensorLike,
+    resolution: float,
+    device: torch.device | str | None = None,
+) -> list[Tensor]:
     """The D coordinate lists of `grid`, float64 [m]; arguments and errors are the same."""
-    lower = torch.as_tensor(lower, dtype=torch.float64, device=device)
-    upper = torch.as_tensor(upper, dtype=torch.float64, device=lower.device)
+    lower = to_tensor(lower, "lower", device)
+    upper = to_tensor(upper, "upper", lower.device)
     if not (resolution > 0 and math.isfinite(resolution)):
         raise ValueError(f"resolution must be > 0 m and finite; got {resolution}")
     if lower.ndim != 1 or lower.shape != upper.shape or not (lower <= upper).all():
@@ -76,7 +96,9 @@ def grid_axes(lower: Any, upper: Any, resolution: float, device: Any = None) -> 
             f"got {lower.tolist()} and {upper.tolist()}"
         )
     if not (lower.isfinite().all() and upper.isfinite().all()):
-        raise ValueError(f"lower and upper must be finite; got {lower} and {upper}")
+        raise ValueError(
+            f"lower and upper must be finite; got {lower.tolist()} and {upper.tolist()}"
+        )
     counts = ((upper - lower) / resolution + 1e-6).floor().long() + 1  # 1e-6: 0.3 / 0.1 is 2.99...
     return [
         start + resolution * torch.arange(int(count), dtype=torch.float64, device=lower.device)
@@ -84,20 +106,22 @@ def grid_axes(lower: Any, upper: Any, resolution: float, device: Any = None) -> 
     ]
 
 
-def query_grid(model: Any, lower: Any, upper: Any, resolution: float) -> Tensor:
-    """Probability at all points of `grid`, without storing the points.
+def query_grid(
+    model: OccupancyMap, lower: TensorLike, upper: TensorLike, resolution: float
+) -> Tensor:
+    """Probability at all points of `grid`, which are never held in memory at once.
 
     Args:
-        model: a map.
-        lower: (D,) lower corner, world frame [m].
-        upper: (D,) upper corner, world frame [m].
-        resolution: distance of neighboring points [m].
+        model: the map.
+        lower: (D,) first point, world frame [m].
+        upper: (D,) far corner [m].
+        resolution: distance between neighboring points [m].
 
     Returns:
-        (nx, ny, nz) probabilities with the dtype and the device of the map.
+        (n1, ..., nD) in the dtype and on the device of the map, without gradient.
 
     Raises:
-        ValueError: see `grid`.
+        ValueError: as for `grid`; or the corners do not have the dimension of the map.
     """
     axes = grid_axes(lower, upper, resolution, model.origin.device)
     if len(axes) != model.dim:
@@ -106,43 +130,45 @@ def query_grid(model: Any, lower: Any, upper: Any, resolution: float) -> Tensor:
 
 
 @torch.no_grad()
-def lattice_values(model: Any, axes: list[Tensor], *, probability: bool) -> Tensor:
+def lattice_values(model: OccupancyMap, axes: list[Tensor], *, probability: bool) -> Tensor:
     """Probability, or log-odds, at all combinations of D lists of world coordinates [m].
 
-    By the map's own ``query_lattice``, where it has one; else a million points at a time.
+    Returns:
+        (len(axes[0]), len(axes[1]), ...) without gradient.
     """
-    if hasattr(model, "query_lattice"):
-        return model.query_lattice(axes, probability=probability)
-    answer = model if probability else model.log_odds
+    native = native_lattice(model, axes, probability)
+    if native is not None:
+        return native
     shape = [len(axis) for axis in axes]
     result = model.centers.new_empty(math.prod(shape))
     for start in range(0, len(result), BLOCK_POINTS):
         stop = min(start + BLOCK_POINTS, len(result))
         index = torch.unravel_index(torch.arange(start, stop, device=result.device), shape)
         points = torch.stack([axis[i] for axis, i in zip(axes, index, strict=True)], dim=1)
-        result[start:stop] = answer(points)
+        result[start:stop] = model(points) if probability else model.log_odds(points)
     return result.reshape(shape)
 
 
 def query_slice(
-    model: Any,
+    model: OccupancyMap,
     height: float | None = None,
     resolution: float = 0.05,
-    bounds: tuple[Any, Any] | None = None,
+    bounds: tuple[TensorLike, TensorLike] | None = None,
 ) -> Slice:
     """Probability on a horizontal plane of a 3-D map, or on all of a 2-D map.
 
     Args:
         model: the map.
         height: z of the plane [m]; None for a 2-D map.
-        resolution: distance of neighboring points [m].
-        bounds: lower and upper (x, y) [m]; None: those of the map.
+        resolution: distance between neighboring points [m].
+        bounds: lower and upper (x, y) [m]; further coordinates are ignored. None: `map_bounds`.
 
     Returns:
-        The axes and the probabilities of the slice.
+        (nx, ny) probabilities and their extent [m].
 
     Raises:
-        ValueError: height is missing for a 3-D map or given for a 2-D one; another dimension.
+        ValueError: height is missing for a 3-D map or given for a 2-D one; the map has another
+            dimension; or as for `grid`.
     """
     if model.dim not in (2, 3):
         raise ValueError(
@@ -150,9 +176,9 @@ def query_slice(
         )
     if (height is None) != (model.dim == 2):
         raise ValueError(f"height must be a number in 3-D and None in 2-D; got {height}")
-    lower, upper = map_bounds(model) if bounds is None else bounds
+    ends = map_bounds(model) if bounds is None else bounds
     level = [] if height is None else [float(height)]
-    lower, upper = ([*torch.as_tensor(end).tolist()[:2], *level] for end in (lower, upper))
+    lower, upper = ([*to_tensor(end, "bounds").tolist()[:2], *level] for end in ends)
     axes = grid_axes(lower, upper, resolution)
     probability = query_grid(model, lower, upper, resolution)
     probability = probability.reshape(len(axes[0]), len(axes[1]))
@@ -161,15 +187,15 @@ def query_slice(
 
 
 @torch.no_grad()
-def map_bounds(model: Any, margin: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Lower and upper corner of the mapped space: all clusters, three standard deviations around.
+def map_bounds(model: OccupancyMap, margin: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Axis-aligned bounding box of all clusters, three standard deviations around each.
 
     Args:
         model: the map.
         margin: added on all sides [m].
 
     Returns:
-        (D,) and (D,) float64, world frame [m].
+        lower and upper corner, (D,) float64, world frame [m].
 
     Raises:
         ValueError: the map is empty.
@@ -180,59 +206,70 @@ def map_bounds(model: Any, margin: float = 0.0) -> tuple[Tensor, Tensor]:
     return lower.amin(dim=0) - margin, upper.amax(dim=0) + margin
 
 
-def cluster_boxes(model: Any, sign: int = 0) -> tuple[Tensor, Tensor]:
-    """(M, D) and (M, D) corners of the boxes around each cluster's three standard deviations.
+def cluster_boxes(model: OccupancyMap, sign: int = 0) -> tuple[Tensor, Tensor]:
+    """Axis-aligned boxes of three standard deviations around each cluster.
 
-    The standard deviation along axis d is the length of row d of the factor. World frame, float64.
-    With a sign of 1 or -1 only of the clusters whose weights have it.
+    The standard deviation of a kernel along axis d is the length of row d of its factor.
+
+    Args:
+        model: the map.
+        sign: 1 or -1 for the clusters whose weights have this sign; 0 for all.
+
+    Returns:
+        (M, D) lower and (M, D) upper corners, float64, world frame [m].
     """
     boxes = []
     for piece in pieces(model):
         chosen = piece.weights.detach() * sign > 0 if sign else slice(None)
         factors = piece.scale_tril.detach()[chosen].double()
-        reach = NUM_STDS * torch.linalg.vector_norm(factors, dim=2)
+        half_edges = NUM_STDS * torch.linalg.vector_norm(factors, dim=2)
         centers = piece.centers.detach()[chosen].double() + piece.origin
-        boxes.append((centers - reach, centers + reach))
+        boxes.append((centers - half_edges, centers + half_edges))
     if not boxes:
         boxes = [(model.origin.new_zeros(0, model.dim),) * 2]
     return torch.cat([lower for lower, _ in boxes]), torch.cat([upper for _, upper in boxes])
 
 
 @torch.no_grad()
-def nearest_support(model: Any, points: Tensor, sign: int) -> Support:
-    """The nearest cluster whose weight has this sign, of (N, D) float64 world positions [m]."""
+def nearest_support(model: OccupancyMap, points: Tensor, sign: int) -> Support:
+    """The nearest cluster whose weight has this sign, for (N, D) float64 world positions [m]."""
     support = Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
     for rows, part in local_parts(model, points, points):
-        supporters = (part.weights * sign > 0).nonzero().squeeze(1)
-        if len(supporters) == 0:
+        chosen = (part.weights * sign > 0).nonzero().squeeze(1)
+        if len(chosen) == 0:
             continue
-        centers = part.centers.detach()[supporters]
+        centers = part.centers.detach()[chosen]
         local = (points[rows] - part.origin).to(centers.dtype)
         nearest = nearest_centers(local, centers, 1).squeeze(1)
-        stds = torch.linalg.svdvals(part.scale_tril.detach()[supporters].double())
+        stds = torch.linalg.svdvals(part.scale_tril.detach()[chosen].double())
         support.centers[rows] = centers[nearest].double() + part.origin
         support.thickness[rows] = stds[nearest, -1]
     return support
 
 
-def pieces(model: Any) -> Iterable[Any]:
-    """Maps that together hold every cluster once: the map itself, or its tiles one by one."""
-    return model.pieces() if hasattr(model, "pieces") else (model,)
+def occupancy_gradient(model: OccupancyMap, points: TensorLike) -> Tensor:
+    """Gradient of the log-odds, which points into obstacles.
 
+    Args:
+        model: the map.
+        points: (..., D) world positions [m].
 
-def local_parts(model: Any, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, Any]]:
-    """Numbers of some of N boxes, (N, D) to (N, D) world [m], and a map that answers inside of them.
-
-    All numbers with the map itself; of a tiled map those of boxes near each other, and a part of it.
+    Returns:
+        (..., D) in the dtype of the points, float64 for arrays and lists [1/m].
     """
-    if hasattr(model, "local_parts"):
-        yield from model.local_parts(lower, upper)
-    else:
-        yield torch.arange(len(lower), device=lower.device), model
-
-
-def occupancy_gradient(model: Any, points: Tensor) -> Tensor:
-    """(..., D) gradient of the log-odds at (..., D) world points [1/m]: the way into obstacles."""
+    if not isinstance(points, Tensor):
+        points = to_tensor(points, "points", model.origin.device)
     with torch.enable_grad():
         points = points.detach().clone().requires_grad_()
         return torch.autograd.grad(model.log_odds(points).sum(), points)[0]
+
+
+def threshold_log_odds(threshold: float) -> float:
+    """Log-odds of a probability threshold.
+
+    Raises:
+        ValueError: threshold is not between 0 and 1, both excluded.
+    """
+    if not 0 < threshold < 1:
+        raise ValueError(f"threshold must be between 0 and 1, both excluded; got {threshold}")
+    return math.log(threshold / (1 - threshold))

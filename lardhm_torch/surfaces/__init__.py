@@ -1,1 +1,1 @@
-"""Meshes of what is occupied."""
+"""Surface meshes of occupied space."""

@@ -1,40 +1,45 @@
-"""From a level of the probability to the ridge of the log-odds behind it, where the hits lie.
+"""Move a mesh from a level set of the log-odds to the ridge behind it, where the hits lie.
 
-Free space is learned only up to some centimeters before each hit, so the surface at 1/2 lies in
-front of what was measured. Across a surface log-odds are largest at the hits themselves.
+Free space is learned only up to some centimeters before each hit, so the level set at probability
+1/2 lies in front of the hits. Across a surface, the log-odds are largest at the hits themselves.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.queries.grids import EVIDENCE, nearest_support
+from lardhm_torch.maps import OccupancyMap
+from lardhm_torch.queries.grids import nearest_support
+from lardhm_torch.queries.raycasting import first_peak, parabola_vertex
 
 if TYPE_CHECKING:
     import trimesh
 
-REACH = 4.0  # standard deviations behind a vertex within which its ridge is sought
-STEPS = 16  # into which the reach is divided
-CHUNK_VERTICES = 1 << 18  # probed at a time
+MAX_DEPTH = 4.0  # standard deviations behind a vertex within which its ridge is sought
+STEPS = 16  # into which this depth is divided
+CHUNK_VERTICES = 1 << 18  # vertices evaluated at a time
 
 
 @torch.no_grad()
-def mesh_on_ridge(model: Any, mesh: trimesh.Trimesh, resolution: float) -> trimesh.Trimesh:
-    """A level's mesh, its vertices moved against their normals to the ridge of the log-odds.
+def mesh_on_ridge(model: OccupancyMap, mesh: trimesh.Trimesh, resolution: float) -> trimesh.Trimesh:
+    """Move the vertices of a level-set mesh against their normals to the ridge of the log-odds.
 
-    The way is sought within four standard deviations of the nearest occupied cluster (across its
-    surface), and is the mean of a vertex's own and its neighbors'. A face is left out where a
-    corner and its neighbors found no ridge, or where the ways of its corners differ by more than a
-    cell: its corners have met different surfaces.
+    The ridge is sought within four standard deviations of the nearest occupied cluster (its
+    smallest). Each vertex moves by the mean of its own depth and those of its neighbors. A face is
+    removed if a corner and its neighbors have no ridge, or if the depths of its corners differ by
+    more than a cell: they belong to different surfaces.
 
     Args:
-        model: a map.
-        mesh: faces at one level of its probability, normals into free space.
+        model: the map.
+        mesh: level set of its probability, normals into free space.
         resolution: edge of the cells that the mesh was made with [m].
+
+    Returns:
+        A new mesh without colors.
     """
     import trimesh
 
@@ -45,7 +50,7 @@ def mesh_on_ridge(model: Any, mesh: trimesh.Trimesh, resolution: float) -> trime
     thickness = nearest_support(model, vertices, sign=1).thickness
     depths = mean_with_neighbors(ridge_depths(model, vertices, normals, thickness), faces)
     corners = depths[faces]
-    kept = corners.amax(dim=1) - corners.amin(dim=1) <= resolution  # never, if one is NaN
+    kept = corners.amax(dim=1) - corners.amin(dim=1) <= resolution  # False if one is NaN
     moved = vertices - depths.nan_to_num()[:, None] * normals
     result = trimesh.Trimesh(moved.cpu().numpy(), faces[kept].cpu().numpy(), process=False)
     result.remove_unreferenced_vertices()
@@ -53,52 +58,54 @@ def mesh_on_ridge(model: Any, mesh: trimesh.Trimesh, resolution: float) -> trime
 
 
 @torch.no_grad()
-def ridge_depths(model: Any, vertices: Tensor, normals: Tensor, thickness: Tensor) -> Tensor:
-    """How far behind each vertex log-odds are largest, before they fall by 1 from there.
+def ridge_depths(
+    model: OccupancyMap, vertices: Tensor, normals: Tensor, thickness: Tensor
+) -> Tensor:
+    """Depth of the first peak of the log-odds behind each vertex.
 
     Args:
-        model: anything with ``log_odds(points)``.
+        model: the map.
         vertices: (V, D) world positions [m].
         normals: (V, D) of length 1, into free space.
         thickness: (V,) standard deviation of the surface across itself [m].
 
     Returns:
-        (V,) depths against the normals [m]; NaN where log-odds rise all the way to `REACH` standard
-        deviations, or not at all.
+        (V,) depths against the normals [m]; NaN if the peak is at either end of the `MAX_DEPTH`
+        standard deviations searched.
     """
     numbers = torch.arange(STEPS + 1, device=vertices.device)[:, None, None]
-    strides = thickness * (REACH / STEPS)
-    found = []
+    strides = thickness * (MAX_DEPTH / STEPS)
+    depths = []
     for start, step in zip(
         vertices.split(CHUNK_VERTICES),
         (normals * strides[:, None]).split(CHUNK_VERTICES),
         strict=True,
     ):
-        found.append(_first_top(model.log_odds(start - numbers * step).double()))
-    return torch.cat(found) * strides
+        depths.append(_peak_position(model.log_odds(start - numbers * step).double().T))
+    return torch.cat(depths) * strides
 
 
-def _first_top(values: Tensor) -> Tensor:
-    """(S, V) values at equal steps -> (V,) where their first top is, in steps; NaN if at an end.
+def _peak_position(log_odds: Tensor) -> Tensor:
+    """(V, S) log-odds at equal steps -> (V,) position of the first peak in steps; NaN at an end.
 
-    Between steps it is the top of the parabola through three of them.
+    A parabola through three steps gives the position between steps.
     """
-    highest = values.cummax(dim=0)
-    fallen = values < highest.values - EVIDENCE
-    last = len(values) - 1
-    end = torch.where(fallen.any(dim=0), fallen.to(torch.uint8).argmax(dim=0), last)
-    top = highest.indices.gather(0, end[None]).squeeze(0)
-    around = top.clamp(1, last - 1) + torch.arange(-1, 2, device=top.device)[:, None]
-    before, here, after = values.gather(0, around)
-    bend = before - 2 * here + after
-    shift = torch.where(bend < 0, 0.5 * (before - after) / bend, 0.0).clamp(-1.0, 1.0)
-    return torch.where((top > 0) & (top < last), top + shift, torch.nan)
+    last = log_odds.shape[1] - 1
+    peak = first_peak(log_odds)
+    around = peak.clamp(1, last - 1)[:, None] + torch.arange(-1, 2, device=peak.device)
+    position = peak + parabola_vertex(log_odds.gather(1, around))
+    return torch.where((peak > 0) & (peak < last), position, torch.nan)
 
 
 def mean_with_neighbors(values: Tensor, faces: Tensor) -> Tensor:
-    """(V,) mean of each vertex's value and those of its neighbors in (F, 3) faces; NaN do not count.
+    """Mean of each vertex's value and those of its neighbors; NaN values are ignored.
 
-    NaN only where there is no value at all.
+    Args:
+        values: (V,).
+        faces: (F, 3) vertices of each face.
+
+    Returns:
+        (V,), NaN where neither the vertex nor any neighbor has a value.
     """
     known = ~values.isnan()
     sums, counts = torch.where(known, values, 0.0), known.to(values.dtype)
@@ -108,8 +115,8 @@ def mean_with_neighbors(values: Tensor, faces: Tensor) -> Tensor:
 
 
 def _edges(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends of each edge, once."""
+    """Both ends of each edge, each edge once."""
     pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
     low, high = pairs.unbind(dim=1)
-    keys = (low * (int(faces.max()) + 1) + high).unique()  # many times faster than unique rows
+    keys = (low * (int(faces.max()) + 1) + high).unique()  # much faster than unique rows
     return keys // (int(faces.max()) + 1), keys % (int(faces.max()) + 1)

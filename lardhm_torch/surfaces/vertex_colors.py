@@ -1,52 +1,79 @@
-"""Colors of a surface's vertices: height, nearest cluster, how sure, how well known."""
+"""Vertex colors of a surface: height, nearest cluster, its probability, or the map's uncertainty."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.maps import OccupancyMap, log_odds_variance
 from lardhm_torch.queries.grids import nearest_support
 
 COLORS = ("height", "cluster", "probability", "variance")
-CHUNK_VERTICES = 1 << 18  # whose variance is asked at a time
+CHUNK_VERTICES = 1 << 18  # vertices evaluated at a time
 
 
 @torch.no_grad()
 def vertex_colors(
-    model: Any, vertices: np.ndarray, side: int, color: str | None
+    model: OccupancyMap, vertices: np.ndarray, sign: int, color: str | None
 ) -> np.ndarray | None:
-    """(V, 3) world positions [m] -> (V, 4) RGBA, or None for no colors.
+    """Colors of the vertices of a mesh.
 
-    "cluster" and "probability" (at its center) are those of the nearest cluster whose weight has
-    the sign ``side``.
+    Args:
+        model: the map.
+        vertices: (V, 3) world positions [m].
+        sign: of the weights of the clusters that "cluster" and "probability" refer to.
+        color: one of `COLORS`, or None.
+
+    Returns:
+        (V, 4) uint8 RGBA; None without vertices or with color None.
     """
     from matplotlib import colormaps
 
     if color is None or len(vertices) == 0:
         return None
     if color == "height":
-        return colormaps["viridis"](_stretch(vertices[:, 2]), bytes=True)
-    places = torch.as_tensor(np.array(vertices), device=model.origin.device)
+        return colormaps["viridis"](_stretched(vertices[:, 2], 0.01), bytes=True)
     if color == "variance":
-        variance = torch.cat([model.variance(part) for part in places.split(CHUNK_VERTICES)])
-        return colormaps["plasma"](_stretch(variance.double().cpu().numpy()), bytes=True)
-    centers = nearest_support(model, places, side).centers
+        return variance_colors(model, vertices)
+    points = torch.as_tensor(np.array(vertices), device=model.origin.device)
+    centers = nearest_support(model, points, sign).centers
     if color == "cluster":
-        return colormaps["tab20"](_shades(centers), bytes=True)
+        return colormaps["tab20"](_color_numbers(centers), bytes=True)
     return colormaps["viridis"](2 * model(centers).cpu().numpy() - 1, bytes=True)
 
 
-def _shades(centers: Tensor) -> np.ndarray:
-    """(V,) one of 20 for each center (V, 3), by its place in millimeters: neighbors differ mostly."""
-    place = (torch.nan_to_num(centers) * 1e3).round().long().cpu()
-    mixed = (place * torch.tensor([73856093, 19349663, 83492791])).sum(dim=1)
+@torch.no_grad()
+def variance_colors(model: OccupancyMap, vertices: np.ndarray) -> np.ndarray:
+    """(V, 3) world positions [m] -> (V, 4) uint8 RGBA: dark where the map is certain, else bright.
+
+    The scale is logarithmic, from the 2 % to the 98 % quantile of the variances.
+    """
+    from matplotlib import colormaps
+
+    points = torch.as_tensor(np.array(vertices), device=model.origin.device)
+    variance = torch.cat([log_odds_variance(model, part) for part in points.split(CHUNK_VERTICES)])
+    logs = np.log10(np.maximum(variance.double().cpu().numpy(), 1e-12))
+    return colormaps["magma"](_stretched(logs, 0.02), bytes=True)
+
+
+def has_variance(model: OccupancyMap) -> bool:
+    """Whether the map can color by variance: it has ``variance``, and its posterior is computed."""
+    try:
+        log_odds_variance(model, model.centers[:1].detach().double() + model.origin)
+    except (ValueError, RuntimeError):
+        return False
+    return True
+
+
+def _color_numbers(centers: Tensor) -> np.ndarray:
+    """(V, 3) centers -> (V,) one of 20 colors, by a hash of the position in millimeters."""
+    position = (torch.nan_to_num(centers) * 1e3).round().long().cpu()
+    mixed = (position * torch.tensor([73856093, 19349663, 83492791])).sum(dim=1)
     return (((mixed * 2654435761) >> 16) % 20).numpy()
 
 
-def _stretch(values: np.ndarray) -> np.ndarray:
-    """Values to colors' [0, 1]; a few stray faces shall not set the scale."""
-    low, high = np.quantile(values, [0.01, 0.99])
+def _stretched(values: np.ndarray, tail: float) -> np.ndarray:
+    """Scale values so that the given quantiles at both ends are 0 and 1: outliers do not count."""
+    low, high = np.quantile(values, [tail, 1 - tail])
     return (values - low) / max(high - low, 1e-9)

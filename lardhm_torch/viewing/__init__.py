@@ -1,1 +1,1 @@
-"""Pictures and pages of a map."""
+"""Images of a map, and an interactive viewer."""

@@ -1,4 +1,4 @@
-"""Pictures without a screen: shaded meshes and slices of the probability, as PNG."""
+"""Offline rendering to PNG, without a display: shaded meshes and slices of the probability."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.maps import OccupancyMap, TensorLike
 from lardhm_torch.queries.grids import query_slice
 
 if TYPE_CHECKING:
     import trimesh
 
-SUPERSAMPLING = 2  # each pixel is the mean of 2 x 2
+SUPERSAMPLING = 2  # samples per pixel along each axis
 FIELD_OF_VIEW = math.radians(35)
-CHUNK_PIXELS = 1 << 20  # pixels tested against triangles, or shaded, at a time
+CHUNK_PIXELS = 1 << 20  # pixels rasterized or shaded at a time
 LIGHT = np.array([-0.35, 0.45, 0.82])  # right, up, toward the camera; unit length
-AMBIENT = 0.35  # brightness of a face turned away from the light
-SMOOTH = math.cos(math.radians(40))  # a vertex normal farther than this from its face is an edge
+AMBIENT = 0.35  # brightness of a face that points away from the light
+SMOOTH = math.cos(math.radians(40))  # a larger angle of vertex and face normal is a sharp edge
 PLAIN = (205, 205, 210)  # color of a mesh without colors
-NOTHING = np.iinfo(np.uint64).max
+EMPTY = np.iinfo(np.uint64).max  # z-buffer where no triangle is
 
 
 def render_mesh(
@@ -36,22 +37,19 @@ def render_mesh(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     cull: bool = True,
 ) -> np.ndarray:
-    """A picture of a mesh: perspective, smooth shading, darker in corners, white background.
-
-    A z-buffer in NumPy: each triangle's pixels are tested against its edges, and each pixel keeps
-    the nearest triangle.
+    """Render a mesh: perspective, smooth shading, ambient occlusion, white background.
 
     Args:
-        mesh: with vertex colors or without.
-        path: where to write a PNG; None writes nothing.
+        mesh: with or without vertex colors.
+        path: PNG file to write; None: none.
         azimuth: direction from the scene to the camera, counterclockwise seen from above, from +x
             (or from +y, if x is up) [degrees].
         elevation: of the camera above the horizon [degrees].
         size: width and height [pixels].
-        zoom: above 1 for a closer view of the middle.
-        cut_above: faces that reach higher than this along ``up`` are left out, such as a ceiling [m].
-        up: direction that points up in the picture; (0, -1, 0) in the frame of a camera.
-        cull: leave out faces seen from behind, so that walls do not hide the room behind them.
+        zoom: values above 1 magnify the middle.
+        cut_above: omit faces with a vertex higher than this along ``up``, such as a ceiling [m].
+        up: direction that points up in the image; (0, -1, 0) in the frame of a camera.
+        cull: cull back faces, so that walls do not hide the room behind them.
 
     Returns:
         (height, width, 3) uint8 RGB.
@@ -77,8 +75,8 @@ def render_mesh(
         color, depth = _shade(mesh, faces[seen_faces], screen, pixels, width, axes)
         depths = np.zeros(height * width, dtype=np.float32)
         depths[pixels] = depth
-        darkness = _corners(depths.reshape(height, width)).reshape(-1)[pixels]
-        image.reshape(-1, 3)[pixels] = color * darkness[:, None]
+        brightness = _ambient_occlusion(depths.reshape(height, width)).reshape(-1)[pixels]
+        image.reshape(-1, 3)[pixels] = color * brightness[:, None]
     small = image.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3).mean(axis=(1, 3))
     result = small.clip(0, 255).astype(np.uint8)
     if path is not None:
@@ -90,23 +88,23 @@ def render_mesh(
 
 
 def render_slice(
-    model: Any,
+    model: OccupancyMap,
     path: str | Path,
     height: float | None = None,
     resolution: float = 0.02,
-    bounds: tuple[Any, Any] | None = None,
+    bounds: tuple[TensorLike, TensorLike] | None = None,
 ) -> None:
-    """Write a picture of the probability on a horizontal plane: free blue, unknown white, occupied red.
+    """Render the probability on a horizontal plane: free blue, unknown white, occupied red.
 
     Args:
         model: a map of two or three dimensions.
-        path: of the PNG.
+        path: PNG file to write.
         height: z of the plane [m]; None for a 2-D map.
         resolution: edge of a pixel [m].
-        bounds: lower and upper (x, y) [m]; left out: those of the map.
+        bounds: lower and upper (x, y) [m]; None: those of the map.
 
     Raises:
-        ValueError: the path does not end in .png, or `query_slice` refuses an argument.
+        ValueError: the path does not end in .png, or as for `query_slice`.
     """
     from matplotlib.figure import Figure
 
@@ -136,11 +134,11 @@ def render_slice(
 
 def _check_png(path: str | Path | None) -> None:
     if path is not None and Path(path).suffix.lower() != ".png":
-        raise ValueError(f"path must end in .png for a picture; got {Path(path).name!r}")
+        raise ValueError(f"path must end in .png for an image; got {Path(path).name!r}")
 
 
 def _camera_axes(azimuth: float, elevation: float, up: tuple[float, float, float]) -> np.ndarray:
-    """(3, 3) unit vectors of the camera in its rows: right, up, and from the scene to the camera."""
+    """(3, 3) unit vectors of the camera frame in rows: right, up, and toward the camera."""
     turn, rise = math.radians(azimuth), math.radians(elevation)
     top = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     start = np.eye(3)[1 if abs(top[0]) > 0.9 else 0]
@@ -155,9 +153,10 @@ def _camera_axes(azimuth: float, elevation: float, up: tuple[float, float, float
 def _project(
     vertices: np.ndarray, faces: np.ndarray, axes: np.ndarray, width: int, height: int, zoom: float
 ) -> np.ndarray:
-    """(V, 3) pixel x, pixel y (downward) and 1 / depth; the faces fill the picture.
+    """Perspective projection (V, 3): pixel x, pixel y (downward) and 1 / depth.
 
-    All but 0.2 % of their area, that is: stray faces far away shall not shrink the rest.
+    The camera distance is chosen so that the faces fill the image, except for outliers of 0.2 % of
+    their area.
     """
     corners = vertices[faces]
     area = np.linalg.norm(
@@ -167,8 +166,8 @@ def _project(
     low, high = (_quantile(vertices[used], area, q) for q in (0.002, 0.998))
     seen = (vertices - (low + high) / 2) @ axes.T
     tangent = math.tan(FIELD_OF_VIEW / 2)
-    reach = np.abs(seen[used, :2]) / (tangent * np.array([width / height, 1.0]))
-    nearest = (seen[used, 2] + reach.max(axis=1))[:, None]
+    needed = np.abs(seen[used, :2]) / (tangent * np.array([width / height, 1.0]))
+    nearest = (seen[used, 2] + needed.max(axis=1))[:, None]
     distance = 1.04 * float(_quantile(nearest, area, 0.998)[0])
     depth = np.maximum(distance - seen[:, 2], 0.01 * distance)
     focal = zoom * height / (2 * tangent)
@@ -177,18 +176,18 @@ def _project(
     return np.stack([x, y, 1 / depth], axis=1)
 
 
-def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> np.ndarray:
-    """(C,) of each column of (N, C) values, the one below which this share of the weight lies."""
+def _quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> np.ndarray:
+    """(C,) weighted quantiles of the columns of (N, C) values."""
     order = values.argsort(axis=0)
     total = weights[order].cumsum(axis=0)
-    row = (total < share * total[-1]).sum(axis=0)
+    row = (total < fraction * total[-1]).sum(axis=0)
     return np.take_along_axis(values, np.take_along_axis(order, row[None], axis=0), axis=0)[0]
 
 
 def _rasterize(
     triangles: np.ndarray, width: int, height: int, cull: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) covered pixels (row * width + column) and (P,) the nearest triangle on each."""
+    """(P,) covered pixels (row * width + column) and (P,) nearest triangle on each, by z-buffer."""
     x, y = triangles[..., 0], triangles[..., 1]
     area = (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0]) - (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
     left = np.ceil(x.min(axis=1) - 0.5).clip(0).astype(np.int64)
@@ -199,27 +198,27 @@ def _rasterize(
     counts = columns * rows * (area > 0 if cull else area != 0)
     order = counts.nonzero()[0]
     cuts = np.searchsorted(counts[order].cumsum(), np.arange(1, 1 << 20) * CHUNK_PIXELS)
-    buffer = np.full(width * height, NOTHING, dtype=np.uint64)
+    buffer = np.full(width * height, EMPTY, dtype=np.uint64)
     for chunk in np.split(order, np.unique(cuts[cuts < len(order)])):
         face = np.repeat(chunk, counts[chunk])
-        place = np.arange(len(face)) - np.repeat(
+        number = np.arange(len(face)) - np.repeat(
             counts[chunk].cumsum() - counts[chunk], counts[chunk]
         )
-        column = left[face] + place % columns[face]
-        row = top[face] + place // columns[face]
-        share = _barycentric(triangles[face], column + 0.5, row + 0.5)
-        inside = (share >= 0).all(axis=1)
+        column = left[face] + number % columns[face]
+        row = top[face] + number // columns[face]
+        weights = _barycentric(triangles[face], column + 0.5, row + 0.5)
+        inside = (weights >= 0).all(axis=1)
         face, pixel = face[inside], (row * width + column)[inside]
-        depth = 1 / (share[inside] * triangles[face, :, 2]).sum(axis=1)
-        # positive floats order like their bits: depth first, then the face's number
+        depth = 1 / (weights[inside] * triangles[face, :, 2]).sum(axis=1)
+        # the bits of positive floats sort like the floats: depth first, then the face index
         key = depth.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
         np.minimum.at(buffer, pixel, key | face.astype(np.uint64))
-    pixels = (buffer != NOTHING).nonzero()[0]
+    pixels = (buffer != EMPTY).nonzero()[0]
     return pixels, (buffer[pixels] & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
 def _barycentric(triangles: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(P, 3) shares of the three corners at pixel positions x, y; all >= 0 inside."""
+    """(P, 3) barycentric coordinates of pixel positions x, y; all >= 0 inside the triangle."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     double = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
     of_b = ((x - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (y - a[:, 1])) / double
@@ -235,7 +234,7 @@ def _shade(
     width: int,
     axes: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 3) lit colors, 0 to 255, and (P,) depths of the seen pixels; corners (P, 3) vertices."""
+    """(P, 3) shaded colors, 0 to 255, and (P,) depths of pixels whose faces have (P, 3) corners."""
     vertices = np.asarray(mesh.vertices) @ axes.T
     normals = np.asarray(mesh.vertex_normals) @ axes.T
     visual: Any = mesh.visual
@@ -246,37 +245,37 @@ def _shade(
     for start in range(0, len(pixels), CHUNK_PIXELS):
         part = slice(start, start + CHUNK_PIXELS)
         corner, pixel = corners[part], pixels[part]
-        share = _barycentric(screen[corner], pixel % width + 0.5, pixel // width + 0.5)
-        weighted = share * screen[corner, 2]  # perspective: linear in 1 / depth
-        depth[part] = 1 / weighted.sum(axis=1)
-        share = weighted * depth[part, None]
+        weights = _barycentric(screen[corner], pixel % width + 0.5, pixel // width + 0.5)
+        weights = weights * screen[corner, 2]  # perspective: linear in 1 / depth
+        depth[part] = 1 / weights.sum(axis=1)
+        weights = weights * depth[part, None]
         edges = vertices[corner[:, 1:]] - vertices[corner[:, :1]]
         flat = np.cross(edges[:, 0], edges[:, 1])
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
         smooth = normals[corner]  # (P, 3 corners, 3)
         near = (smooth * flat[:, None]).sum(axis=2, keepdims=True) > SMOOTH
-        normal = (share[..., None] * np.where(near, smooth, flat[:, None])).sum(axis=1)
+        normal = (weights[..., None] * np.where(near, smooth, flat[:, None])).sum(axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        normal *= np.where(flat[:, 2:] < 0, -1, 1)  # faces seen from behind are lit as well
+        normal *= np.where(flat[:, 2:] < 0, -1, 1)  # back faces are lit as well
         light = AMBIENT + (1 - AMBIENT) * (normal @ LIGHT).clip(0)
-        color[part] = (share[..., None] * colors[corner]).sum(axis=1) * light[:, None]
+        color[part] = (weights[..., None] * colors[corner]).sum(axis=1) * light[:, None]
     return color, depth
 
 
-def _corners(depths: np.ndarray) -> np.ndarray:
-    """(height, width) brightness in (0, 1]: less where a pixel lies deeper than those around it.
+def _ambient_occlusion(depths: np.ndarray) -> np.ndarray:
+    """(height, width) brightness in (0, 1]: lower where a pixel is deeper than its surroundings.
 
-    The depth image (0 where nothing is seen) minus its blurred self, as in Luft, Colditz, Deussen,
-    "Image enhancement by unsharp masking the depth buffer", 2006.
+    Depths are 0 where no face is. Source: Luft, Colditz, Deussen, "Image enhancement by unsharp
+    masking the depth buffer", 2006.
     """
     from scipy.ndimage import gaussian_filter
 
-    seen = (depths > 0).astype(np.float32)
-    if not seen.any():
-        return seen
+    covered = (depths > 0).astype(np.float32)
+    if not covered.any():
+        return covered
     logs = np.log(depths, where=depths > 0, out=np.zeros_like(depths))
     brightness = np.ones_like(depths)
     for radius, strength in ((depths.shape[0] / 200, 10.0), (depths.shape[0] / 40, 4.0)):
-        around = gaussian_filter(logs, radius) / np.maximum(gaussian_filter(seen, radius), 1e-6)
+        around = gaussian_filter(logs, radius) / np.maximum(gaussian_filter(covered, radius), 1e-6)
         brightness *= np.exp(-strength * (logs - around).clip(0, 0.08))
     return brightness

@@ -1,4 +1,4 @@
-"""What a viewer shows of a map, as arrays: slice, ellipsoids, points and colors.
+"""The 3-D scene of the viewer: surface, slice, cluster ellipsoids and scan points.
 
 Positions are relative to an ``offset`` near the middle of the map, so that float32 is enough.
 """
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.maps import OccupancyMap, covariance_scale
 from lardhm_torch.queries.grids import query_slice
 from lardhm_torch.scans import Scans
 
@@ -19,62 +20,66 @@ if TYPE_CHECKING:
 
 OCCUPIED, FREE = (200, 70, 60), (70, 110, 190)  # colors of the clusters
 SLICE_PIXELS = 512  # along the longer edge
-MESH_FACES = 200_000  # about; the resolution is chosen for it
-MOST_FACES = 600_000  # about; where surfaces are so thin that they need finer cells
-SHEET_CELLS = 1.5  # thicknesses: through larger cells thin sheets slip
-SHOWN_FACES = 60_000  # of a surface on the page
-KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light that is painted on
+MESH_FACES = 200_000  # approximate number of faces for which the resolution is chosen
+MAX_MESH_FACES = 600_000  # approximate limit where thin surfaces need finer cells
+SHEET_CELLS = 1.5  # largest cell in thicknesses of a surface; larger cells leave holes
+SHOWN_FACES = 60_000  # limit for the surface on the page
+MAX_CLUSTERS = 10_000  # limit for the ellipsoids on the page
+KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light baked into the surface
 
 
-def core_box(model: Any, share: float = 0.02, margin: float = 0.5) -> tuple[Tensor, Tensor]:
-    """(3,) and (3,) world corners around all but the outermost clusters [m]: what is worth a look."""
-    chosen = model.weights > 0
-    centers = model.centers[chosen if bool(chosen.any()) else ...].detach().double().cpu()
-    ends = torch.quantile(centers, torch.tensor([share, 1 - share], dtype=torch.float64), dim=0)
-    return ends[0] + model.origin.cpu() - margin, ends[1] + model.origin.cpu() + margin
+def core_box(model: OccupancyMap) -> tuple[Tensor, Tensor]:
+    """Lower and upper corner (3,) of the box to show, world frame [m].
+
+    From the 2 % to the 98 % quantile of the centers of the occupied clusters, plus 0.5 m.
+    """
+    occupied = model.weights > 0
+    centers = model.centers[occupied if bool(occupied.any()) else ...].detach().double().cpu()
+    ends = torch.quantile(centers, torch.tensor([0.02, 0.98], dtype=torch.float64), dim=0)
+    return ends[0] + model.origin.cpu() - 0.5, ends[1] + model.origin.cpu() + 0.5
 
 
-def view_resolution(model: Any) -> float:
-    """Edge of a cell [m] at which the surface has about `MESH_FACES` faces.
+def view_resolution(model: OccupancyMap) -> float:
+    """Edge of a cell [m] for a surface of about `MESH_FACES` faces.
 
-    The clusters lie on the surface like tiles of two standard deviations to each side. Where they
-    are thin (a quarter of them is thinner), cells are smaller, for up to about `MOST_FACES`: a floor
-    slips between the nodes of a lattice much coarser than it is thick, and has holes.
+    The area of the surface is estimated from the occupied clusters, each covering two standard
+    deviations to either side. Thin clusters (first quartile) make cells smaller, down to about
+    `MAX_MESH_FACES` faces, because a surface much thinner than a cell has holes.
     """
     factors = model.scale_tril.detach()[model.weights > 0].double()
     if len(factors) == 0:
         return 0.1
-    axes = torch.linalg.svdvals(factors)  # of the kernels, the longest first
-    area = 8 / model.covariance_scale * float((axes[:, 0] * axes[:, 1]).sum())
-    wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MOST_FACES))
+    axes = torch.linalg.svdvals(factors)  # standard deviations, largest first
+    area = 8 / covariance_scale(model) * float((axes[:, 0] * axes[:, 1]).sum())
+    wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MAX_MESH_FACES))
     thin = float(axes[:, -1].quantile(0.25))
     return max(0.02, fine, min(wide, SHEET_CELLS * thin))
 
 
 def slice_picture(
-    model: Any, height: float, core: tuple[Tensor, Tensor], offset: np.ndarray
+    model: OccupancyMap, height: float, core: tuple[Tensor, Tensor], offset: np.ndarray
 ) -> dict[str, Any]:
-    """Probability at a height above the offset [m], as the arguments of viser's `add_image`."""
+    """Slice of the probability at a height above the offset [m], as arguments of `add_image`."""
     from matplotlib import colormaps
 
     pixel = float((core[1] - core[0])[:2].max()) / SLICE_PIXELS
     probability, extent = query_slice(model, height + float(offset[2]), pixel, core)
-    p = probability.float().cpu().numpy().T[::-1]  # rows from the top, that is from large y
+    p = probability.float().cpu().numpy().T[::-1]  # first row at the largest y
     image = colormaps["RdBu_r"](p, bytes=True)
-    image[..., 3] = np.clip(np.abs(p - 0.5) * 1000, 40, 235)  # the unknown is nearly clear
+    image[..., 3] = np.clip(np.abs(p - 0.5) * 1000, 40, 235)  # unknown is nearly transparent
     middle = [(extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2]
     return {
         "image": image,
         "render_width": extent[1] - extent[0],
         "render_height": extent[3] - extent[2],
         "format": "png",
-        "wxyz": (0.0, 1.0, 0.0, 0.0),  # image rows go down: turned about x, they go along -y
+        "wxyz": (0.0, 1.0, 0.0, 0.0),  # half a turn about x: image rows run along -y
         "position": (middle[0] - offset[0], middle[1] - offset[1], height),
     }
 
 
-def ellipsoids(model: Any, chosen: Tensor, offset: np.ndarray) -> dict[str, Any]:
-    """Clusters at one standard deviation, as the arguments of viser's batched meshes."""
+def ellipsoids(model: OccupancyMap, chosen: Tensor, offset: np.ndarray) -> dict[str, Any]:
+    """Ellipsoids of one standard deviation of the points of clusters, as viser's batched meshes."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=1)
@@ -87,24 +92,24 @@ def ellipsoids(model: Any, chosen: Tensor, offset: np.ndarray) -> dict[str, Any]
         "faces": ball.faces,
         "batched_wxyzs": quaternions(axes.numpy()),
         "batched_positions": (centers.numpy() - offset).astype(np.float32),
-        "batched_scales": (stds / model.covariance_scale**0.5).numpy().astype(np.float32),
+        "batched_scales": (stds / covariance_scale(model) ** 0.5).numpy().astype(np.float32),
     }
 
 
-def fewer_faces(mesh: trimesh.Trimesh, most: int = SHOWN_FACES) -> trimesh.Trimesh:
-    """The mesh with at most about so many faces, flat parts first; colors of the nearest vertices.
+def fewer_faces(mesh: trimesh.Trimesh, limit: int = SHOWN_FACES) -> trimesh.Trimesh:
+    """Simplify a mesh to about ``limit`` faces; vertices get the color of the nearest old vertex.
 
     Source: Garland & Heckbert 1997, quadric error metrics (by fast-simplification).
     """
     import trimesh
     from scipy.spatial import cKDTree
 
-    if len(mesh.faces) <= most:
+    if len(mesh.faces) <= limit:
         return mesh
     import fast_simplification
 
     vertices, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float32), mesh.faces, target_count=most
+        mesh.vertices.astype(np.float32), mesh.faces, target_count=limit
     )
     nearest = cKDTree(mesh.vertices).query(vertices)[1]
     visual: Any = mesh.visual
@@ -113,9 +118,9 @@ def fewer_faces(mesh: trimesh.Trimesh, most: int = SHOWN_FACES) -> trimesh.Trime
 
 
 def painted_glb(mesh: trimesh.Trimesh) -> bytes:
-    """The mesh as GLB whose colors hold the light already, so that a page need not compute it.
+    """Encode a mesh as GLB with the lighting baked into its colors, for an unlit material.
 
-    Half of the light comes from everywhere, more from above; the rest from one side.
+    Half of the light is ambient, stronger from above; the rest comes from `KEY_LIGHT`.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
@@ -124,7 +129,7 @@ def painted_glb(mesh: trimesh.Trimesh) -> bytes:
     light = 0.5 + 0.12 * normals[:, 2:] + 0.42 * np.clip(normals @ KEY_LIGHT, 0, None)[:, None]
     visual: Any = mesh.visual
     colors = np.asarray(visual.vertex_colors).copy()
-    linear = (colors[:, :3] / 255 * light.clip(0, 1)) ** 2.2  # glTF's vertex colors are linear
+    linear = (colors[:, :3] / 255 * light.clip(0, 1)) ** 2.2  # glTF vertex colors are linear
     colors[:, :3] = (255 * linear).round()
 
     def unlit(tree: dict[str, Any]) -> None:
@@ -138,50 +143,27 @@ def painted_glb(mesh: trimesh.Trimesh) -> bytes:
     return export_glb(trimesh.Scene(painted), include_normals=False, tree_postprocessor=unlit)
 
 
-def scan_points(scans: Scans, most: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) hits, of too many one for each cube of a lattice, and (N, 3) grays that tell height."""
+def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) hits, at most about ``limit``, and (N, 3) uint8 gray levels by height."""
     from matplotlib import colormaps
 
     hits = scans.hits
     hits = hits[hits.isfinite().all(dim=1)].cpu()
-    points = thinned((hits.numpy() - offset).astype(np.float32), most)
+    points = thinned((hits.numpy() - offset).astype(np.float32), limit)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
     return points, colormaps["gray"](shades, bytes=True)[:, :3]
 
 
-def thinned(points: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of (N, 3) points: the first in each cube of a lattice that is coarse enough."""
+def thinned(points: np.ndarray, limit: int) -> np.ndarray:
+    """At most ``limit`` of (N, 3) points: the first in each voxel, with voxels as large as needed."""
     kept, edge = np.arange(len(points)), 0.01
-    while len(kept) > most:
+    while len(kept) > limit:
         cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
         sides = cells.max(axis=0) + 1
         kept = np.unique(np.ravel_multi_index(cells.T, sides), return_index=True)[1]
-        edge *= max(1.02, (len(kept) / most) ** 0.4)  # points on surfaces go with the edge squared
+        edge *= max(1.02, (len(kept) / limit) ** 0.4)  # on surfaces the count goes with edge^-2
     return points[np.sort(kept)]
-
-
-def knows_variance(model: Any) -> bool:
-    """Whether the map can tell how unsure it is: has ``variance``, and what that needs."""
-    if not hasattr(model, "variance"):
-        return False
-    try:
-        model.variance(model.centers[:1].detach().double() + model.origin)
-    except RuntimeError:
-        return False
-    return True
-
-
-def variance_colors(model: Any, vertices: np.ndarray) -> np.ndarray:
-    """(V, 4) RGBA: dark where the map is certain, bright where it is not."""
-    from matplotlib import colormaps
-
-    points = torch.as_tensor(vertices, device=model.centers.device)
-    with torch.no_grad():
-        variance = model.variance(points).double().cpu().numpy()
-    logs = np.log10(np.maximum(variance, 1e-12))
-    low, high = np.quantile(logs, [0.02, 0.98])
-    return colormaps["magma"]((logs - low) / max(high - low, 1e-9), bytes=True)
 
 
 def quaternions(rotations: np.ndarray) -> np.ndarray:
@@ -192,7 +174,12 @@ def quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 class Stage:
-    """What is seen of a map on the page of a server; positions are relative to ``offset`` (3,) [m]."""
+    """Draws a map on the page of a viser server.
+
+    Args:
+        server: the viser server.
+        offset: (3,) world position of the origin of the page [m].
+    """
 
     def __init__(self, server: Any, offset: np.ndarray) -> None:
         self.server, self.offset = server, offset
@@ -200,7 +187,7 @@ class Stage:
         self._light()
 
     def _light(self) -> None:
-        """One lamp where the painted light comes from: viser's own lights bleach the clusters."""
+        """Replace viser's lights, which overexpose the clusters, by one from `KEY_LIGHT`."""
         scene = self.server.scene
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
@@ -210,7 +197,7 @@ class Stage:
         )
 
     def follow(self, name: str, control: Any) -> None:
-        """Show what has this name, now or later, while the checkbox is set."""
+        """Bind the visibility of a scene node, existing or not, to a checkbox."""
         self._controls[name] = control
 
         def apply(_: Any) -> None:
@@ -225,7 +212,7 @@ class Stage:
         return name not in self._controls or bool(self._controls[name].value)
 
     def draw_surface(self, mesh: trimesh.Trimesh) -> int:
-        """The surface, with as few faces as a page needs; returns how many."""
+        """Show the surface, simplified to `SHOWN_FACES`; returns the number of faces shown."""
         scene = self.server.scene
         if len(mesh.faces) == 0:
             scene.remove_by_name("/surface")
@@ -242,8 +229,10 @@ class Stage:
         )
         return len(shown.faces)
 
-    def draw_slice(self, model: Any, height: float | None, core: tuple[Tensor, Tensor]) -> None:
-        """The probability at a height above the offset [m], or none."""
+    def draw_slice(
+        self, model: OccupancyMap, height: float | None, core: tuple[Tensor, Tensor]
+    ) -> None:
+        """Show the slice at a height above the offset [m]; None removes it."""
         scene = self.server.scene
         if height is None:
             scene.remove_by_name("/slice")
@@ -251,10 +240,10 @@ class Stage:
         picture = slice_picture(model, height, core, self.offset)
         scene.add_image("/slice", **picture, cast_shadow=False, receive_shadow=False)
 
-    def draw_clusters(self, model: Any, most: int) -> None:
-        """Ellipsoids of the clusters with the largest weights."""
+    def draw_clusters(self, model: OccupancyMap) -> None:
+        """Show ellipsoids of the `MAX_CLUSTERS` clusters with the largest absolute weights."""
         weights = model.weights.detach()
-        order = weights.abs().argsort(descending=True)[:most]
+        order = weights.abs().argsort(descending=True)[:MAX_CLUSTERS]
         for name, color, mask in (
             ("/clusters/occupied", OCCUPIED, weights[order] > 0),
             ("/clusters/free", FREE, weights[order] < 0),
@@ -273,9 +262,9 @@ class Stage:
                 visible=self._visible(name),
             )
 
-    def draw_scans(self, scans: Scans, most: int) -> int:
-        """At most so many points, and the sensors; returns how many points."""
-        points, colors = scan_points(scans, most, self.offset)
+    def draw_scans(self, scans: Scans, limit: int) -> int:
+        """Show the sensors and at most ``limit`` points; returns the number of points shown."""
+        points, colors = scan_points(scans, limit, self.offset)
         scene = self.server.scene
         scene.add_point_cloud("/scans", points, colors, point_size=0.02, precision="float32")
         origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
@@ -285,14 +274,14 @@ class Stage:
         return len(points)
 
     def resize_points(self, size: float) -> None:
-        """Edge of the scans' points [m]."""
+        """Set the size of the scan points [m]."""
         self.server.scene.get_handle_by_name("/scans").point_size = size
 
     def aim(self, core: tuple[Tensor, Tensor]) -> None:
-        """From obliquely above, far enough to see where most clusters are."""
+        """Place the camera obliquely above the box, far enough to see all of it."""
         low, high = (end.numpy() - self.offset for end in core)
-        reach = max(float(np.linalg.norm(high - low)), 1.0)
+        distance = max(float(np.linalg.norm(high - low)), 1.0)
         camera = self.server.initial_camera
         camera.look_at = tuple((low + high) / 2)
-        camera.position = tuple((low + high) / 2 + reach * np.array([0.25, -0.5, 0.5]))
+        camera.position = tuple((low + high) / 2 + distance * np.array([0.25, -0.5, 0.5]))
         self.server.scene.set_up_direction("+z")

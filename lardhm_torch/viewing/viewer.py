@@ -1,12 +1,11 @@
-"""A map in the browser: surface, slice, clusters and scans on a page that a server sends.
+"""Interactive viewer in the browser: surface, slice, clusters and scans of a map.
 
-viser does the drawing; it works without a screen, and `MapViewer.export` writes the scene as one
-file. Coordinates on the page are relative to the middle of the map, in float32.
+Drawing is done by viser. No display is needed, and `MapViewer.export` writes the scene to a file.
+Coordinates on the page are relative to the middle of the map, in float32.
 """
 
 from __future__ import annotations
 
-import copy
 import os
 import threading
 from dataclasses import dataclass
@@ -16,48 +15,49 @@ from typing import Any
 import numpy as np
 
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.maps import OccupancyMap, snapshot
 from lardhm_torch.scans import Scans
-from lardhm_torch.surfaces.meshing import COLORS, lattice_mesh, surface_lattice
-from lardhm_torch.viewing.scene import (
-    Stage,
-    core_box,
-    knows_variance,
-    variance_colors,
-    view_resolution,
-)
+from lardhm_torch.surfaces.meshing import SurfaceLattice, lattice_mesh, surface_lattice
+from lardhm_torch.surfaces.vertex_colors import COLORS, has_variance
+from lardhm_torch.viewing.scene import Stage, core_box, view_resolution
 
 EXPORT_SUFFIXES = (".html", ".viser")
 THRESHOLD_HINT = (
-    "The surface stays where the hits lie. A higher threshold leaves out what the map is less sure of, "
-    "and shows the backs of what it is sure of."
+    "The surface stays on the hits. A higher threshold removes parts of which the map is less certain "
+    "and closes the surface behind objects."
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig:
-    """Where the page is served and how much is sent to it."""
+    """Settings of the viewer.
 
-    host: str = "127.0.0.1"  # 0.0.0.0: other machines may look, too
-    port: int = 8080  # the next free one, if it is taken
-    resolution: float | None = None  # [m] of the surface; None: by `scene.view_resolution`
-    max_points: int = 100_000  # of the scans; of more, one for each small cube
-    max_clusters: int = 10_000  # ellipsoids; those with the largest weights of more
+    Attributes:
+        host: address to serve at; "0.0.0.0" accepts other machines.
+        port: TCP port; the next free one if it is taken.
+        resolution: edge of the cells of the surface [m]; None: chosen by `scene.view_resolution`.
+        max_points: limit for the scan points; above it, one point per voxel is shown.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    resolution: float | None = None
+    max_points: int = 100_000
 
     def __post_init__(self) -> None:
         if self.resolution is not None and not self.resolution > 0:
             raise ValueError(f"resolution must be > 0 m; got {self.resolution}")
-        for name in ("max_points", "max_clusters"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be 1 or more; got {getattr(self, name)}")
+        if self.max_points < 1:
+            raise ValueError(f"max_points must be 1 or more; got {self.max_points}")
 
 
 class MapViewer:
-    """A page that shows a map; meshing goes on in a thread, so that the page stays responsive.
+    """Serve a page that shows a map. Surfaces are extracted in a background thread.
 
     Args:
-        model: a 3-D map with clusters.
-        scans: shown as points and sensor positions, where given.
-        config: where to serve, and how much.
+        model: a 3-D map with clusters; later changes are shown by `update`.
+        scans: also shown, as points and sensor positions.
+        config: address and resolution.
 
     Raises:
         ImportError: viser is not installed.
@@ -65,54 +65,54 @@ class MapViewer:
     """
 
     def __init__(
-        self, model: Any, scans: Scans | None = None, config: ViewConfig | None = None
+        self, model: OccupancyMap, scans: Scans | None = None, config: ViewConfig | None = None
     ) -> None:
         self.config = config or ViewConfig()
-        _check_model(model)
+        self._model = _checked_snapshot(model)
         self.server = _new_server(self.config)
-        self._core = core_box(model)
+        self._core = core_box(self._model)
         self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
         self._stage = Stage(self.server, self.offset)
-        self._model = _snapshot(model)
-        self._lattice: Any = None
+        self._lattice: SurfaceLattice | None = None
         self._report = ""
-        self._wanted: set[str] = set()
+        self._jobs: set[str] = {"map"}
         self._changed = threading.Condition()
         self._closed = False
         self._add_controls()
         if scans is not None:
             self._add_scans(scans)
         self._stage.aim(self._core)
-        self.update(model)
         self._worker = threading.Thread(target=self._work, daemon=True)
         self._worker.start()
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{self.config.host}:{self.server.get_port()}"
 
-    def update(self, model: Any) -> None:
-        """Show this state of the map: a loop that grows it calls this after each step.
+    def update(self, model: OccupancyMap) -> None:
+        """Show the current map, for example after each step of a mapping loop.
 
-        Returns at once; states that come faster than they can be drawn are left out.
-        """
-        _check_model(model)
-        snapshot = _snapshot(model)
-        with self._changed:
-            self._model = snapshot
-        self._ask("map")
-
-    def wait(self) -> None:
-        """Until all that was asked for is on the page."""
-        with self._changed:
-            self._changed.wait_for(lambda: not self._wanted or self._closed)
-
-    def export(self, path: str | os.PathLike[str]) -> None:
-        """Write the scene to one .html file that opens in any browser, or to a .viser file.
+        Returns immediately. Updates that arrive faster than they can be drawn are skipped.
 
         Raises:
-            ValueError: the path ends in neither.
+            ValueError: the map is not 3-D or is empty.
+        """
+        current = _checked_snapshot(model)
+        with self._changed:
+            self._model = current
+        self._request("map")
+
+    def wait(self) -> None:
+        """Block until all requested changes are on the page."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._jobs or self._closed)
+
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """Write the scene to a self-contained .html file for any browser, or to a .viser file.
+
+        Raises:
+            ValueError: the path has another extension.
         """
         path = Path(path)
         if path.suffix.lower() not in EXPORT_SUFFIXES:
@@ -141,8 +141,8 @@ class MapViewer:
         with gui.add_folder("Surface"):
             self._show_mesh = gui.add_checkbox("show surface", True)
             self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5, hint=THRESHOLD_HINT)
-            known = knows_variance(self._model)
-            colors = [color for color in COLORS if known or color != "variance"]
+            available = has_variance(self._model)
+            colors = [color for color in COLORS if available or color != "variance"]
             self._color = gui.add_dropdown("color", colors, initial_value="height")
         lower, upper = (end.numpy() - self.offset for end in self._core)
         with gui.add_folder("Slice"):
@@ -157,10 +157,10 @@ class MapViewer:
         with gui.add_folder("Clusters"):
             self._show_occupied = gui.add_checkbox("show occupied", False)
             self._show_free = gui.add_checkbox("show free", False)
-        self._threshold.on_update(lambda _: self._ask("surface"))
-        self._color.on_update(lambda _: self._ask("surface"))
+        self._threshold.on_update(lambda _: self._request("surface"))
+        self._color.on_update(lambda _: self._request("surface"))
         for control in (self._show_slice, self._height):
-            control.on_update(lambda _: self._ask("slice"))
+            control.on_update(lambda _: self._request("slice"))
         for name, control in (
             ("/surface", self._show_mesh),
             ("/clusters/occupied", self._show_occupied),
@@ -180,20 +180,19 @@ class MapViewer:
         self._stage.follow("/sensors", sensors)
         size.on_update(lambda _: self._stage.resize_points(size.value))
 
-    def _ask(self, job: str) -> None:
+    def _request(self, job: str) -> None:
         with self._changed:
-            self._wanted.add(job)
+            self._jobs.add(job)
             self._changed.notify_all()
 
     def _work(self) -> None:
-        """The thread: does what was asked for last, and forgets what was asked for before."""
+        """Background thread: draws the latest map, once for all requests so far."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._wanted or self._closed)
+                self._changed.wait_for(lambda: self._jobs or self._closed)
                 if self._closed:
                     return
-                jobs = self._wanted
-                self._wanted = {"busy"}  # one drawing answers all that was asked for until now
+                jobs, self._jobs = self._jobs, {"busy"}
                 model = self._model
             try:
                 self._status.content = "*drawing ...*"
@@ -201,51 +200,46 @@ class MapViewer:
             except Exception as error:
                 self._status.content = f"**{type(error).__name__}**: {error}"
             with self._changed:
-                self._wanted.discard("busy")
+                self._jobs.discard("busy")
                 self._changed.notify_all()
 
-    def _draw(self, model: Any, jobs: set[str]) -> None:
-        """The slice, the surface, or all of a new map: what is among the jobs."""
-        if "map" in jobs:
+    def _draw(self, model: OccupancyMap, jobs: set[str]) -> None:
+        """Redraw what the jobs name: "slice", "surface", or "map" for everything."""
+        if "map" in jobs or self._lattice is None:
             resolution = self.config.resolution or view_resolution(model)
             self._lattice = surface_lattice(model, resolution, keep=True)
-            self._stage.draw_clusters(model, self.config.max_clusters)
+            self._stage.draw_clusters(model)
         if jobs & {"map", "slice"}:
             height = float(self._height.value) if self._show_slice.value else None
             self._stage.draw_slice(model, height, self._core)
         if jobs & {"map", "surface"}:
-            self._report = self._draw_surface(model)
+            self._report = self._draw_surface(model, self._lattice)
         self._status.content = self._report
 
-    def _draw_surface(self, model: Any) -> str:
-        """Draws it, and says what was drawn."""
-        color, threshold = self._color.value, float(self._threshold.value)
-        plain = None if color == "variance" else color
-        mesh = lattice_mesh(model, self._lattice, threshold, color=plain)
-        if color == "variance" and len(mesh.vertices):
-            visual: Any = mesh.visual
-            visual.vertex_colors = variance_colors(model, np.asarray(mesh.vertices))
+    def _draw_surface(self, model: OccupancyMap, lattice: SurfaceLattice) -> str:
+        """Show the surface; returns the status line."""
+        mesh = lattice_mesh(model, lattice, float(self._threshold.value), color=self._color.value)
         shown = self._stage.draw_surface(mesh)
         return (
-            f"{len(model):,} clusters; surface of {len(mesh.faces):,} faces, "
-            f"{shown:,} shown, cells of {self._lattice.resolution:.3g} m. "
+            f"{len(model.weights):,} clusters; surface of {len(mesh.faces):,} faces, "
+            f"{shown:,} shown, cells of {lattice.resolution:.3g} m. "
             f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
         )
 
 
 class LiveView:
-    """The page of a map that does not exist yet: opened by the first update, redrawn by each.
+    """A viewer that opens with the first non-empty map, for maps under construction.
 
     Args:
-        config: where to serve, and how much.
+        config: settings of the viewer.
     """
 
     def __init__(self, config: ViewConfig | None = None) -> None:
         self.config = config
         self.viewer: MapViewer | None = None
 
-    def update(self, model: Any) -> None:
-        """Show this state of the map; an empty one is not shown yet."""
+    def update(self, model: OccupancyMap) -> None:
+        """Show the current map; an empty map is ignored."""
         if len(model.centers) == 0:
             return
         if self.viewer is None:
@@ -254,7 +248,7 @@ class LiveView:
             self.viewer.update(model)
 
     def close(self) -> None:
-        """Stop serving, if there was anything to serve."""
+        """Stop the viewer, if it was opened."""
         if self.viewer is not None:
             self.viewer.close()
 
@@ -270,14 +264,11 @@ def _new_server(config: ViewConfig) -> Any:
     return viser.ViserServer(config.host, config.port, label="lardhm", verbose=False)
 
 
-def _check_model(model: Any) -> None:
+def _checked_snapshot(model: OccupancyMap) -> OccupancyMap:
+    """A copy of the map that later changes to the map do not affect, or a ValueError."""
     if model.dim != 3:
         raise ValueError(f"model must be a 3-D map to be viewed; got {model.dim}-D")
-    if len(model.centers) == 0:
+    copied = snapshot(model)
+    if len(copied.centers) == 0:
         raise ValueError("the map must hold clusters to be viewed; it is empty: fit it first")
-
-
-def _snapshot(model: Any) -> Any:
-    """A copy that training on does not change."""
-    whole = model.merge() if hasattr(model, "merge") else copy.deepcopy(model)
-    return whole.requires_grad_(False)
+    return copied

@@ -1,7 +1,7 @@
-"""Exact Gaussian processes on few points, many at once: what three of the baselines are made of.
+"""Batches of small exact Gaussian processes, the basis of three baselines.
 
 Classes are regressed as targets -1 and +1 and squashed to a probability afterwards (Rasmussen &
-Williams 2006, Section 6.5), so that everything is closed-form but the hyperparameters.
+Williams 2006, Section 6.5), so that everything except the hyperparameters is in closed form.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 LEARNING_STEPS = 40
-LEARNING_RATE = 0.15  # of the logarithms, a step
-NOISE_FLOOR = 1e-3  # variance; keeps Cholesky factors sound in float32
-SQUASHES = (0.1, 100.0, 61)  # first, last and number of the steepnesses tried
+LEARNING_RATE = 0.15  # of Adam, for the logarithms
+NOISE_FLOOR = 1e-3  # variance; keeps Cholesky factors stable in float32
+SQUASHES = (0.1, 100.0, 61)  # first, last and number of candidates for the steepness
 
 Kernel = Callable[[Tensor, Tensor], Tensor]  # distances [m], lengthscale [m] -> correlation
 
@@ -32,7 +32,7 @@ class Posterior(NamedTuple):
     """Gaussian processes conditioned on their own points; padding has ``coefficients`` 0.
 
     ``points`` (B, n, D) [m]; ``factor`` (B, n, n) lower Cholesky factor of covariance plus noise;
-    ``coefficients`` (B, n), that matrix' inverse times the targets.
+    ``coefficients`` (B, n), the inverse of this matrix times the targets.
     """
 
     points: Tensor
@@ -41,7 +41,7 @@ class Posterior(NamedTuple):
 
 
 def squared_exponential(distances: Tensor, lengthscale: Tensor) -> Tensor:
-    """Correlation exp(-r^2 / 2 l^2) of points r apart.
+    """Correlation exp(-r^2 / (2 l^2)) at distance r.
 
     Source: Guizilini & Ramos 2016, eq. (8) with one lengthscale.
     """
@@ -49,12 +49,12 @@ def squared_exponential(distances: Tensor, lengthscale: Tensor) -> Tensor:
 
 
 def thin_plate(distances: Tensor, lengthscale: Tensor) -> Tensor:
-    """Thin-plate covariance 2 r^3 - 3 R r^2 + R^3 over R^3; 0 beyond R, the size of the scene.
+    """Thin-plate covariance (2 r^3 - 3 R r^2 + R^3) / R^3; 0 beyond R, the size of the scene.
 
     Source: Williams & Fitzgibbon 2006, "Gaussian process implicit surfaces", eq. (9).
     """
-    share = (distances / lengthscale).clamp(max=1.0)
-    return 2 * share**3 - 3 * share.square() + 1
+    ratio = (distances / lengthscale).clamp(max=1.0)
+    return 2 * ratio**3 - 3 * ratio.square() + 1
 
 
 def condition(
@@ -63,11 +63,11 @@ def condition(
     """Exact posterior of B processes.
 
     Args:
-        points: (B, n, D) [m]; rows that are not present may hold anything finite.
+        points: (B, n, D) [m]; padding may have any finite value.
         targets: (B, n) regressed values.
-        present: (B, n) bool; the rest is padding and changes nothing.
+        present: (B, n) bool; False for padding, which has no effect.
         kernel: correlation as a function of distance and lengthscale.
-        scale: shared by all.
+        scale: shared by all processes.
 
     Source: Rasmussen & Williams 2006, Algorithm 2.1.
     """
@@ -82,12 +82,12 @@ def condition(
 def predict(
     posterior: Posterior, queries: Tensor, kernel: Kernel, scale: Hyperparameters
 ) -> tuple[Tensor, Tensor]:
-    """(B, Q, D) positions [m] -> (B, Q) mean and (B, Q) variance of the function, without noise.
+    """(B, Q, D) positions [m] -> (B, Q) mean and (B, Q) variance of the noise-free function.
 
     Source: Rasmussen & Williams 2006, Algorithm 2.1.
     """
     cross = scale.signal * kernel(_distances(posterior.points, queries), scale.lengthscale)
-    present = posterior.factor.diagonal(dim1=-2, dim2=-1) != 1  # padding covaries with nothing
+    present = posterior.factor.diagonal(dim1=-2, dim2=-1) != 1  # padding has no covariance
     cross = cross * present[..., None]
     mean = (cross * posterior.coefficients[..., None]).sum(dim=-2)
     whitened = torch.linalg.solve_triangular(posterior.factor, cross, upper=False)
@@ -102,15 +102,15 @@ def learn_hyperparameters(
     start: Hyperparameters,
     learn_lengthscale: bool = True,
 ) -> Hyperparameters:
-    """Lengthscale, signal and noise of largest marginal likelihood, summed over the processes.
+    """Lengthscale, signal and noise that maximize the sum of the marginal likelihoods.
 
     Args:
         points: (B, n, D) [m].
         targets: (B, n) regressed values.
         present: (B, n) bool, see `condition`.
         kernel: correlation as a function of distance and lengthscale.
-        start: where Adam starts, in their logarithms.
-        learn_lengthscale: False keeps it, as a thin plate's is the size of the scene.
+        start: initial values; Adam optimizes their logarithms.
+        learn_lengthscale: False keeps the initial lengthscale.
 
     Source: Rasmussen & Williams 2006, eq. (5.8).
     """
@@ -129,14 +129,14 @@ def learn_hyperparameters(
             (misfit + volume).backward()
             optimizer.step()
     lengthscale, signal, noise = logs.detach().exp()
-    kept = lengthscale if learn_lengthscale else start.lengthscale
-    return Hyperparameters(kept, signal, noise + NOISE_FLOOR)
+    final = lengthscale if learn_lengthscale else start.lengthscale
+    return Hyperparameters(final, signal, noise + NOISE_FLOOR)
 
 
 def leave_one_out(
     posterior: Posterior, targets: Tensor, scale: Hyperparameters
 ) -> tuple[Tensor, Tensor]:
-    """(B, n) mean and variance of the function at every point, had it been left out.
+    """(B, n) leave-one-out mean and variance of the function at every point.
 
     Source: Rasmussen & Williams 2006, eq. (5.12).
     """
@@ -154,23 +154,25 @@ def squash(mean: Tensor, variance: Tensor, steepness: Tensor) -> Tensor:
 
 
 def learn_squash(mean: Tensor, variance: Tensor, labels: Tensor) -> Tensor:
-    """Steepness of `squash` with the least class-balanced log-loss on left-out points.
+    """Steepness of `squash` with the lowest class-balanced log-loss on left-out points.
 
     Args:
         mean: (N,) predictions, see `leave_one_out`.
-        variance: (N,) theirs.
+        variance: (N,) of the predictions.
         labels: (N,) 1 occupied, 0 free.
     """
     first, last, count = SQUASHES
-    tried = first * (last / first) ** (torch.arange(count, device=mean.device) / (count - 1))
+    candidates = first * (last / first) ** (torch.arange(count, device=mean.device) / (count - 1))
     losses = []
-    for steepness in tried.to(mean.dtype):
+    for steepness in candidates.to(mean.dtype):
         p = squash(mean, variance, steepness).clamp(1e-6, 1 - 1e-6)
         classes = [-p[labels > 0.5].log(), -(1 - p[labels <= 0.5]).log()]
         losses.append(sum(part.mean() for part in classes if len(part)))
-    return tried[int(torch.stack([torch.as_tensor(loss) for loss in losses]).argmin())].to(mean)
+    return candidates[int(torch.stack([torch.as_tensor(loss) for loss in losses]).argmin())].to(
+        mean
+    )
 
 
 def _distances(a: Tensor, b: Tensor) -> Tensor:
-    """(..., n, m) distances [m]; the expanded form loses digits between near points."""
+    """(..., n, m) distances [m]; the expanded form is inaccurate for near points."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")

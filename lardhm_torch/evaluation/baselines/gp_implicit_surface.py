@@ -1,4 +1,4 @@
-"""GP implicit surface: the scene as the zero level of one function with thin-plate covariance."""
+"""GP implicit surface: the surface as the zero level set of a function with thin-plate covariance."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from lardhm_torch.evaluation.baselines.gp_occupancy_map import GPOccupancyMap
 
 
 class GPImplicitSurface(GPOccupancyMap):
-    """Regression of -1 in free space and +1 at hits with the thin-plate covariance; exact, cubic.
+    """Exact regression of -1 in free space and +1 at hits with thin-plate covariance; cubic cost.
 
-    The thin plate has no lengthscale to learn: its R is the largest distance in the scene. The
-    probability is that of a function above zero, so both GP references answer the same question.
+    The lengthscale is not learned: R is the largest distance in the scene. The probability is that
+    of a function value above zero, so that both GP baselines estimate the same quantity.
 
     Args:
-        seed: of the points that signal and noise are learned from.
+        seed: random seed for the points from which signal and noise are learned.
         dtype: of the computation.
 
     Source: Williams & Fitzgibbon 2006, "Gaussian process implicit surfaces"; named in Guizilini &
@@ -26,7 +26,7 @@ class GPImplicitSurface(GPOccupancyMap):
     learns_lengthscale = False
 
     def start(self, local: Tensor) -> Hyperparameters:
-        """The size of the scene, which no learning changes, and where signal and noise start."""
+        """Size of the scene, which stays fixed, and initial signal and noise."""
         one = local.new_tensor(1.0)
         size = (local.amax(dim=0) - local.amin(dim=0)).square().sum().sqrt()
         return Hyperparameters(size.clamp(min=1e-3), one, 0.1 * one)

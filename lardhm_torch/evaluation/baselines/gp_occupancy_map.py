@@ -1,4 +1,4 @@
-"""GP occupancy map: one exact Gaussian process over the whole scene, at cubic cost."""
+"""GP occupancy map: one exact Gaussian process for the whole scene, at cubic cost."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from lardhm_torch.evaluation.baselines.gaussian_process import (
 from lardhm_torch.points import check_samples
 
 MAX_POINTS = 8000  # the covariance matrix is half a gigabyte, its factor takes 10^11.5 operations
-LEARNING_POINTS = 300  # random ones of which the hyperparameters are learned
-QUERY_ENTRIES = 1 << 24  # covariances of queries and points held at a time
+LEARNING_POINTS = 300  # random points from which the hyperparameters are learned
+QUERY_ENTRIES = 1 << 24  # covariances of query and training points in memory at a time
 
 
 class GPOccupancyMap:
-    """Gaussian process classification of occupied and free, the reference for small scenes.
+    """Gaussian process classification of occupied and free space, for small scenes.
 
     Args:
-        seed: of the points that the hyperparameters are learned from.
+        seed: random seed for the points from which the hyperparameters are learned.
         dtype: of the computation.
 
     Source: O'Callaghan & Ramos 2012, "Gaussian process occupancy maps" (probabilistic
@@ -42,7 +42,7 @@ class GPOccupancyMap:
         self.origin: Tensor | None = None
 
     def start(self, local: Tensor) -> Hyperparameters:
-        """Where learning starts: a tenth of the scene's spread."""
+        """Initial hyperparameters: the lengthscale is a tenth of the standard deviation of the scene."""
         one = local.new_tensor(1.0)
         return Hyperparameters(0.1 * local.std(dim=0, correction=0).max() + 1e-3, one, 0.1 * one)
 
@@ -54,13 +54,13 @@ class GPOccupancyMap:
             labels: (N,) 1 occupied, 0 free.
 
         Raises:
-            ValueError: there are more points, or the samples are bad (see `LardHilbertMap.fit`).
+            ValueError: there are more points, or the samples are invalid (see `LardHilbertMap.fit`).
         """
         points, labels = check_samples(points.double(), labels, points.shape[-1], points.device)
         if len(points) > MAX_POINTS:
             raise ValueError(
                 f"points must be at most {MAX_POINTS} for an exact process, whose cost is cubic; "
-                f"got {len(points)}. Subsample them, or take LocalGP"
+                f"got {len(points)}. Subsample them, or use LocalGP"
             )
         origin = points.mean(dim=0).round()
         local, targets = (points - origin).to(self.dtype), 2 * labels.to(self.dtype) - 1
@@ -81,7 +81,7 @@ class GPOccupancyMap:
         """(N, D) world positions [m] -> (N,) mean of the target in [-1, 1] and (N,) its variance.
 
         Raises:
-            RuntimeError: nothing was fitted yet.
+            RuntimeError: `fit` has not been called.
             ValueError: points are not (N, D).
         """
         if self.origin is None:
@@ -91,8 +91,8 @@ class GPOccupancyMap:
         local = (points.to(torch.float64) - self.origin).to(self.dtype)
         chunk = max(1, QUERY_ENTRIES // self.posterior.points.shape[1])
         parts = [
-            predict(self.posterior, few[None], self.kernel, self.scale)
-            for few in local.split(chunk)
+            predict(self.posterior, part[None], self.kernel, self.scale)
+            for part in local.split(chunk)
         ]
         mean, variance = (torch.cat([part[i][0] for part in parts]) for i in (0, 1))
         return mean, variance
@@ -110,5 +110,5 @@ class GPOccupancyMap:
 
 
 def _single(local: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """One process without padding, as `condition` wants it."""
+    """A batch of one process without padding, as arguments of `condition`."""
     return local[None], targets[None], torch.ones_like(targets, dtype=torch.bool)[None]

@@ -1,4 +1,4 @@
-"""Local Gaussian processes: one for each cluster, the nearest blended by inverse variance."""
+"""Local Gaussian processes: one per cluster; the nearest are averaged by inverse variance."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from lardhm_torch.learning.clustering import mini_batch_kmeans
 from lardhm_torch.native import nearest_centers
 from lardhm_torch.points import check_samples, in_morton_order
 
-LEARNING_CLUSTERS = 32  # random ones of which the hyperparameters are learned,
-LEARNING_POINTS = 128  # from so many random points of each at most
-MAX_POINTS = 512  # a cluster; a larger one keeps a random subset, or its cube is felt
-BATCH_ENTRIES = 1 << 24  # of covariance matrices factored at a time
+LEARNING_CLUSTERS = 32  # random clusters from which the hyperparameters are learned
+LEARNING_POINTS = 128  # largest number of points of each of them that is used
+MAX_POINTS = 512  # per cluster; larger clusters are subsampled, because the cost is cubic
+BATCH_ENTRIES = 1 << 24  # entries of the covariance matrices that are factored at a time
 
 
 class LocalGP:
-    """A Gaussian process for every cluster of points; the k nearest answer for a place.
+    """A Gaussian process for every cluster of points; queries average the k nearest processes.
 
-    Both classes are clustered together: a process that knows one label only has no boundary to
-    learn. The processes share hyperparameters, those of largest marginal likelihood over random
-    clusters; one set for each cluster, learned from its own points, overfits.
+    Both classes are clustered together, because a process with one label only has no boundary to
+    learn. All processes share hyperparameters, which maximize the marginal likelihood of random
+    clusters; separate ones for each cluster overfit.
 
     Args:
-        points_per_cluster: decides the number of clusters.
-        num_neighbors: k nearest processes that are blended.
-        seed: of clustering.
+        points_per_cluster: average number of points per cluster.
+        num_neighbors: number k of nearest processes that are averaged.
+        seed: random seed.
         dtype: of the computation.
 
     Source: Guizilini & Ramos 2016, Section IV.
@@ -63,14 +63,14 @@ class LocalGP:
         self.fitted: _Fitted | None = None
 
     def fit(self, points: Tensor, labels: Tensor) -> LocalGP:
-        """Cluster, learn hyperparameters, condition every process on its cluster.
+        """Cluster the points, learn hyperparameters, and condition every process on its cluster.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free.
 
         Raises:
-            ValueError: the samples are bad (see `LardHilbertMap.fit`).
+            ValueError: the samples are invalid (see `LardHilbertMap.fit`).
         """
         points, labels = check_samples(points.double(), labels, points.shape[-1], points.device)
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
@@ -122,7 +122,7 @@ class LocalGP:
         """(N, D) world positions [m] -> (N,) probability of occupancy; 1/2 far from all points.
 
         Raises:
-            RuntimeError: nothing was fitted yet.
+            RuntimeError: `fit` has not been called.
             ValueError: points are not (N, D).
         """
         mean, variance = self.predict(points)
@@ -134,9 +134,9 @@ class LocalGP:
     def predict(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(N, D) world positions [m] -> (N,) mean of the target in [-1, 1] and (N,) its variance.
 
-        The k nearest processes are weighted by the inverses of their variances, and so are the
-        variances: the answer is as sure as its neighbors are, not surer for being many, because
-        their points are nearly the same.
+        The k nearest processes are weighted by their inverse variances. The variance is their
+        harmonic mean: it does not fall with k, because neighboring processes have correlated
+        points.
         """
         fitted = self._ready()
         if points.ndim != 2 or points.shape[1] != fitted.means.shape[1]:
@@ -176,7 +176,7 @@ class _Fitted(NamedTuple):
 
 
 def _members(local: Tensor, centers: Tensor, rng: torch.Generator) -> list[Tensor]:
-    """Rows of the points of each center, at most MAX_POINTS, drawn at random."""
+    """Rows of the points of each center, at most `MAX_POINTS`, drawn at random."""
     labels = nearest_centers(local, centers, 1).squeeze(1)
     shuffled = torch.randperm(len(local), generator=rng, device=rng.device)
     order = shuffled[labels[shuffled].argsort(stable=True)]
@@ -185,7 +185,7 @@ def _members(local: Tensor, centers: Tensor, rng: torch.Generator) -> list[Tenso
 
 
 def _batches(members: list[Tensor]) -> list[list[Tensor]]:
-    """Clusters in order of size, cut so that a batch of covariance matrices stays small."""
+    """Split clusters, sorted by size, into batches of limited total size of covariance matrices."""
     batches: list[list[Tensor]] = [[]]
     for rows in members:
         if (len(batches[-1]) + 1) * len(rows) ** 2 > BATCH_ENTRIES and batches[-1]:
@@ -195,7 +195,7 @@ def _batches(members: list[Tensor]) -> list[list[Tensor]]:
 
 
 def _pad(local: Tensor, targets: Tensor, batch: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """(B, n, D) points, (B, n) targets and (B, n) which of them are no padding."""
+    """(B, n, D) points, (B, n) targets and (B, n) bool, False for padding."""
     pad = torch.nn.utils.rnn.pad_sequence
     present = pad([torch.ones_like(rows, dtype=torch.bool) for rows in batch], batch_first=True)
     rows = pad(batch, batch_first=True)

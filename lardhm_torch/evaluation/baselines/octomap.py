@@ -1,4 +1,4 @@
-"""OctoMap through octomap-python: an octree of voxels, log-odds added up ray by ray."""
+"""OctoMap by octomap-python: an octree of voxels whose log-odds are summed over rays."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor
 
 from lardhm_torch.scans import Scans
 
-UNKNOWN = -1  # what getLabels answers where no ray came
+UNKNOWN = -1  # label of unobserved voxels in getLabels
 
 
 class OctoMapBaseline:
-    """Voxel occupancy with OctoMap's default sensor model (hit 0.7, miss 0.4, clamped at both ends).
+    """Voxel occupancy with OctoMap's default sensor model (hit 0.7, miss 0.4, clamped log-odds).
 
-    It runs on the CPU in three dimensions. As in the map, an origin is subtracted first: the tree
+    It runs on the CPU and in 3-D only. An origin is subtracted from all coordinates, because a tree
     spans only 2^16 voxels along each axis.
 
     Args:
@@ -33,10 +33,10 @@ class OctoMapBaseline:
         self.tree: Any = None
 
     def fit(self, scans: Scans) -> OctoMapBaseline:
-        """Insert all rays, one scan after the other, into a new tree.
+        """Insert all rays into a new tree, scan by scan.
 
-        Only first returns are inserted: a beam without return, or a later return of a pulse, does
-        not fit OctoMap's rule that a ray is free up to an occupied end.
+        Only first returns are inserted. OctoMap assumes that a ray is free up to an occupied end,
+        which does not hold for no-returns and for later returns of a pulse.
 
         Raises:
             ImportError: octomap-python is not installed.
@@ -60,19 +60,19 @@ class OctoMapBaseline:
         """(N, 3) world positions [m] -> (N,) probability of the voxel; exactly 1/2 where unknown.
 
         Raises:
-            RuntimeError: nothing was inserted yet.
+            RuntimeError: `fit` has not been called.
             ValueError: points are not (N, 3).
         """
         if self.tree is None:
             raise RuntimeError("probability needs a tree; call fit(scans) first")
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points must be (N, 3); got {tuple(points.shape)}")
-        # float32 is the library's own precision, but its single search takes float64 for the key:
-        # beside a voxel's border the two would answer for different voxels.
+        # getLabels works in float32 and search in float64; rounding first makes both use the same
+        # voxel near a voxel border
         local = to_array((points.detach().cpu().double() - self.origin).float())
         probability = np.full(len(local), 0.5)
         for row in np.flatnonzero(self.tree.getLabels(local) != UNKNOWN):
-            # one by one: the library answers in batches with classes only
+            # one by one: the batch query of the library returns labels only
             probability[row] = self.tree.search(local[row]).getOccupancy()
         return torch.from_numpy(probability).to(points.device)
 
@@ -80,7 +80,7 @@ class OctoMapBaseline:
 
 
 def new_tree(resolution: float) -> Any:
-    """An empty octree of octomap-python, or an ImportError that says what to install."""
+    """An empty octree of octomap-python; an ImportError without it names the extra to install."""
     try:
         import octomap
     except ImportError as error:
@@ -92,5 +92,5 @@ def new_tree(resolution: float) -> Any:
 
 
 def to_array(tensor: Tensor) -> np.ndarray:
-    """Contiguous float64 array, which the library reads without conversion."""
+    """Contiguous float64 array, as octomap-python needs it."""
     return np.ascontiguousarray(tensor, dtype=np.float64)

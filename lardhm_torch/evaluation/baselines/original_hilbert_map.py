@@ -1,4 +1,4 @@
-"""The original Hilbert Maps: features that do not know the data, logistic regression by SGD."""
+"""The original Hilbert Maps: features independent of the data, logistic regression by SGD."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from torch import Tensor
 from lardhm_torch.learning.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.points import check_samples, in_morton_order
 
-REACH = 2.5  # [cells] kernels end here, at exp(-2.5^2 / 2) = 4 % for a lengthscale of one cell
+SUPPORT_RADIUS = 2.5  # [cells] kernels are truncated here, at exp(-2.5^2 / 2) = 4 % of the peak
+# for a lengthscale of one cell
 MAX_CELLS = 1 << 28
 CHUNK_POINTS = 1 << 15
 METHODS = ("fourier", "nystroem")
@@ -20,14 +21,14 @@ METHODS = ("fourier", "nystroem")
 class OriginalHilbertMap:
     """Hilbert map with a center at every node of a regular lattice over all training points.
 
-    Weights are trained as those of `LardHilbertMap` (same loss, same classes' balance, same SGD):
-    what differs is where the features sit and how wide they are.
+    The weights are trained as those of `LardHilbertMap`, with the same loss, class weights and SGD.
+    Only the positions and the width of the features differ.
 
     Args:
-        spacing: distance of neighboring centers [m].
+        spacing: distance between neighboring centers [m].
         lengthscale: of the squared exponential, in spacings.
-        config: how the weights are trained.
-        seed: of the order of the points in training.
+        config: settings of the training.
+        seed: random seed for the order of the points in training.
         dtype: of the computation.
 
     Source: Ramos & Ott 2015, "Hilbert maps"; Guizilini & Ramos 2016, Section II-B and Table II.
@@ -51,18 +52,18 @@ class OriginalHilbertMap:
         self.weights: Tensor | None = None
 
     def fit(self, points: Tensor, labels: Tensor) -> OriginalHilbertMap:
-        """Lay the lattice over the points and train its weights.
+        """Build the lattice over the points and train its weights.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free.
 
         Raises:
-            ValueError: the lattice would have more than 2^28 nodes, or the samples are bad (see
+            ValueError: the lattice would have more than 2^28 nodes, or the samples are invalid (see
                 `LardHilbertMap.fit`).
         """
         points, labels = check_samples(points.double(), labels, points.shape[-1], points.device)
-        margin = int(REACH * max(1.0, self.lengthscale)) + 1
+        margin = int(SUPPORT_RADIUS * max(1.0, self.lengthscale)) + 1
         lower = (points.amin(dim=0) / self.spacing).floor() - margin
         shape = (points.amax(dim=0) / self.spacing).ceil() + margin + 1 - lower
         if not float(shape.prod()) <= MAX_CELLS:
@@ -85,19 +86,19 @@ class OriginalHilbertMap:
         return self
 
     def _neighbor_offsets(self, dim: int) -> Tensor:
-        """(K, D) nodes around a point's nearest one, in cells, that its kernels reach."""
-        reach = REACH * max(1.0, self.lengthscale)
-        steps = range(-int(reach), int(reach) + 1)
+        """(K, D) offsets in cells of the nodes within the support radius of the nearest node."""
+        radius = SUPPORT_RADIUS * max(1.0, self.lengthscale)
+        steps = range(-int(radius), int(radius) + 1)
         cube = torch.tensor(list(itertools.product(steps, repeat=dim)))
-        return cube[cube.square().sum(dim=1) <= reach**2]
+        return cube[cube.square().sum(dim=1) <= radius**2]
 
     def features(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, D) world positions [m] -> (N, K) node numbers and (N, K) kernel values, 0 outside."""
+        """(N, D) world positions [m] -> (N, K) node indices and (N, K) kernel values, 0 outside."""
         scaled = (points.to(torch.float64) - self.origin) / self.spacing
         base = scaled.round()
-        rest = (scaled - base).to(self.dtype)
+        remainder = (scaled - base).to(self.dtype)
         nodes = base.long()[:, None] + self.offsets
-        squared = (rest[:, None] - self.offsets).square().sum(dim=2)
+        squared = (remainder[:, None] - self.offsets).square().sum(dim=2)
         values = torch.exp(-0.5 / self.lengthscale**2 * squared)
         values = values * ((nodes >= 0) & (nodes < self.shape)).all(dim=2)
         index = torch.zeros_like(nodes[..., 0])
@@ -110,18 +111,18 @@ class OriginalHilbertMap:
         """(N, D) world positions [m] -> (N,) probability of occupancy; 1/2 outside the lattice.
 
         Raises:
-            RuntimeError: nothing was fitted yet.
+            RuntimeError: `fit` has not been called.
             ValueError: points are not (N, D).
         """
         if self.weights is None:
             raise RuntimeError("probability needs weights; call fit(points, labels) first")
         if points.ndim != 2 or points.shape[1] != len(self.shape):
             raise ValueError(f"points must be (N, {len(self.shape)}); got {tuple(points.shape)}")
-        answers = []
+        parts = []
         for chunk in points.split(CHUNK_POINTS):
             index, values = self.features(chunk)
-            answers.append(torch.sigmoid((values * self.weights[index]).sum(dim=1)))
-        return torch.cat(answers)
+            parts.append(torch.sigmoid((values * self.weights[index]).sum(dim=1)))
+        return torch.cat(parts)
 
     __call__ = probability
 
@@ -129,14 +130,14 @@ class OriginalHilbertMap:
 class KernelApproximationMap:
     """Hilbert map with global features: random Fourier, or Nystroem on random training points.
 
-    scikit-learn makes the features and trains the weights (`RBFSampler` or `Nystroem`, then
-    `SGDClassifier` with logistic loss and elastic net), as the first Hilbert Maps paper did.
+    Features and weights are computed by scikit-learn (`RBFSampler` or `Nystroem`, then
+    `SGDClassifier` with logistic loss and elastic net), as in the first Hilbert Maps paper.
 
     Args:
         method: "fourier" or "nystroem".
-        num_features: their number.
+        num_features: number of features.
         lengthscale: of the squared exponential [m].
-        seed: of features and training.
+        seed: random seed of features and training.
 
     Source: Ramos & Ott 2015, "Hilbert maps", Section IV.
     """
@@ -168,7 +169,7 @@ class KernelApproximationMap:
 
         points, labels = check_samples(points.double(), labels, points.shape[-1], points.device)
         if len(labels.unique()) < 2:
-            raise ValueError("labels must hold both classes for scikit-learn; got one alone")
+            raise ValueError("labels must hold both classes for scikit-learn; got only one")
         self.origin = points.mean(dim=0).round()
         gamma, count = 0.5 / self.lengthscale**2, min(self.num_features, len(points))
         if self.method == "fourier":
@@ -187,7 +188,7 @@ class KernelApproximationMap:
         """(N, D) world positions [m] -> (N,) probability of occupancy.
 
         Raises:
-            RuntimeError: nothing was fitted yet.
+            RuntimeError: `fit` has not been called.
             ValueError: points are not (N, D).
         """
         if self.pipeline is None:
@@ -196,8 +197,8 @@ class KernelApproximationMap:
             raise ValueError(f"points must be (N, {len(self.origin)}); got {tuple(points.shape)}")
         local = (points.to(torch.float64) - self.origin).cpu()
         parts = [
-            torch.from_numpy(self.pipeline.predict_proba(few.numpy())[:, 1])
-            for few in local.split(CHUNK_POINTS)
+            torch.from_numpy(self.pipeline.predict_proba(part.numpy())[:, 1])
+            for part in local.split(CHUNK_POINTS)
         ]
         return torch.cat(parts).to(points.device)
 

@@ -1,0 +1,157 @@
+"""The interface of an occupancy map, as queries, surfaces and viewers use it.
+
+Every object with the members of `OccupancyMap` is a map: `LardHilbertMap`, `TiledMap`, or a class of
+your own. Some maps offer more, for speed or because they do not fit in memory. The functions below
+use these optional members where a map has them, and no other module checks for them.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+TensorLike: TypeAlias = Tensor | np.ndarray | Sequence[object]  # whatever `to_tensor` converts
+
+
+class OccupancyMap(Protocol):
+    """A map of M Gaussian kernels in D dimensions.
+
+    Positions in the world frame are ``origin`` plus positions in the map frame.
+    """
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates D."""
+
+    @property
+    def origin(self) -> Tensor:
+        """(D,) float64 origin of the map frame, world frame [m]."""
+
+    @property
+    def centers(self) -> Tensor:
+        """(M, D) centers of the kernels, map frame [m]."""
+
+    @property
+    def scale_tril(self) -> Tensor:
+        """(M, D, D) lower Cholesky factors of the kernels' covariances [m]."""
+
+    @property
+    def weights(self) -> Tensor:
+        """(M,) weights: positive for occupied, negative for free clusters."""
+
+    def __call__(self, points: Tensor, /) -> Tensor:
+        """(..., D) world positions [m] -> (...) probability of occupancy."""
+
+    def log_odds(self, points: Tensor, /) -> Tensor:
+        """(..., D) world positions [m] -> (...) log-odds of occupancy."""
+
+
+def to_tensor(values: TensorLike, name: str, device: torch.device | str | None = None) -> Tensor:
+    """Convert a tensor, an array or nested lists to a float64 tensor; gradients are kept.
+
+    Args:
+        values: numbers.
+        name: of the argument, for the error.
+        device: of the result; None: that of a tensor, else the CPU.
+
+    Raises:
+        ValueError: values are not numbers, or nested lists differ in length.
+    """
+    if isinstance(values, Tensor):
+        return values.to(device or values.device, torch.float64)
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(
+            f"{name} must be a tensor, an array or equally long lists of numbers; got {values!r}"
+        )
+    return torch.from_numpy(array.astype(np.float64)).to(device)
+
+
+# --- optional members ---
+
+
+def pieces(model: OccupancyMap) -> Iterable[OccupancyMap]:
+    """Maps that together hold every cluster once: the tiles of a tiled map, or the map itself."""
+    return model.pieces() if hasattr(model, "pieces") else (model,)
+
+
+def local_parts(
+    model: OccupancyMap, lower: Tensor, upper: Tensor
+) -> Iterator[tuple[Tensor, OccupancyMap]]:
+    """Split N boxes into groups, each with a map that is exact inside the boxes of the group.
+
+    A tiled map groups boxes that are near each other and loads only the tiles that they need. Any
+    other map is returned once, with all boxes.
+
+    Args:
+        model: the map.
+        lower: (N, D) lower corners, world frame [m].
+        upper: (N, D) upper corners [m].
+
+    Yields:
+        indices of the boxes in a group, and the map for them.
+    """
+    if hasattr(model, "local_parts"):
+        yield from model.local_parts(lower, upper)
+    else:
+        yield torch.arange(len(lower), device=lower.device), model
+
+
+def num_neighbors(model: OccupancyMap) -> int:
+    """Number k of nearest clusters that contribute at a point; all of them if the map has no k."""
+    return model.num_neighbors if hasattr(model, "num_neighbors") else len(model.weights)
+
+
+def covariance_scale(model: OccupancyMap) -> float:
+    """Kernel covariance divided by the covariance of a cluster's points; 1 if not stated."""
+    return getattr(model, "covariance_scale", 1.0)
+
+
+def native_lattice(model: OccupancyMap, axes: list[Tensor], probability: bool) -> Tensor | None:
+    """Probability, or log-odds, on a lattice by the map's own ``query_lattice``; None without it."""
+    if not hasattr(model, "query_lattice"):
+        return None
+    return model.query_lattice(axes, probability=probability)
+
+
+def native_ranges(
+    model: OccupancyMap,
+    origins: Tensor,
+    directions: Tensor,
+    march: tuple[float, float, float, float, bool],
+) -> Tensor | None:
+    """(R,) ranges of rays by the map's own ``query_rays``; None where that is not available."""
+    if getattr(model, "query_rays", None) is None:
+        return None
+    return model.query_rays(origins, directions, march)  # type: ignore[attr-defined]
+
+
+def stored_thickness_counts(model: OccupancyMap) -> Mapping[int, int] | None:
+    """Histogram of kernel thicknesses that a tiled map keeps in its manifest; None for others."""
+    return model.thickness_counts() if hasattr(model, "thickness_counts") else None
+
+
+def log_odds_variance(model: OccupancyMap, points: Tensor) -> Tensor:
+    """(..., D) world positions [m] -> (...) variance of the log-odds.
+
+    Raises:
+        ValueError: the map has no ``variance``.
+        RuntimeError: its posterior has not been computed (`LardHilbertMap.fit_uncertainty`).
+    """
+    if not hasattr(model, "variance"):
+        raise ValueError(f"model must have a variance; {type(model).__name__} has none")
+    return model.variance(points)
+
+
+def snapshot(model: OccupancyMap) -> OccupancyMap:
+    """An independent copy in memory, without gradients; a tiled map is merged."""
+    whole = model.merge() if hasattr(model, "merge") else copy.deepcopy(model)
+    return whole.requires_grad_(False) if hasattr(whole, "requires_grad_") else whole
