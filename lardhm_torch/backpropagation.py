@@ -124,7 +124,7 @@ class TuningRun:
             weights, centers, raw = self.current()
             labels = samples.labels[rows].to(weights.dtype)
             answer = self.log_odds(samples.positions[rows], weights, centers, raw)
-            loss = logistic_loss(answer, labels, factors[labels.long()]) / len(rows)
+            loss = logistic_loss(answer, labels, factors[(2 * labels).long()]) / len(rows)
             moved = sum(offset.square().sum() for offset in self.offsets[1:])
             penalty = config.l2 * weights.square().sum() + config.stiffness * moved
             self.optimizer.zero_grad()

@@ -90,28 +90,38 @@ def cluster_classes(
     Returns:
         (M clusters, the occupied ones first; (M,) bool, which are occupied).
     """
-    classes = split_classes(points, labels > 0.5)
+    classes = split_labels(points, labels)
     if num_clusters is None:
-        totals = [choose_num_clusters(classes[0] if len(classes[0]) else classes[1])] * 2
+        chosen = choose_num_clusters(next(members for members in classes if len(members)))
+        totals = [chosen * share for share in class_shares(len(classes[2]))]
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
     return cluster_each(classes, totals, rng)
 
 
+def class_shares(num_unknown: int) -> tuple[int, int, int]:
+    """Clusters of the occupied, the free and the unknown points, in proportion.
+
+    Free space that must end where the unknown begins takes twice as many clusters.
+    """
+    return (1, 2, 1) if num_unknown else (1, 1, 0)
+
+
 def cluster_each(
     classes: list[Tensor], totals: Sequence[int], rng: torch.Generator
 ) -> tuple[Clusters, Tensor]:
-    """(M clusters, (M,) bool which are occupied) of the occupied and of the free points, in order.
+    """(M clusters, (M,) bool which are occupied) of the points of each class, in order.
 
     Args:
-        classes: (N, D) occupied and (F, D) free positions [m], in the order of `z_order`.
+        classes: (N, D) occupied, (F, D) free and, if given, (U, D) unknown positions [m], in the
+            order of `z_order`.
         totals: how many clusters of each to look for.
         rng: random state.
     """
     parts = [
         cluster_points(members, total, rng)
         for members, total in zip(classes, totals, strict=True)
-        if len(members)
+        if len(members) and total
     ]
     clusters = concatenate_clusters(parts)
     is_occupied = torch.zeros_like(clusters.counts, dtype=torch.bool)
@@ -127,6 +137,14 @@ def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
     return [points_where(points, is_occupied), points_where(points, ~is_occupied)]
 
 
+def split_labels(points: Tensor, labels: Tensor) -> list[Tensor]:
+    """Occupied, free and unknown points, by labels of 1, 0 and 1/2."""
+    occupied, rest = split_classes(points, labels > 0.5)
+    if bool((labels != 0.5).all()):
+        return [occupied, rest, rest[:0]]
+    return [occupied, points_where(points, labels < 0.5), points_where(points, labels == 0.5)]
+
+
 def points_where(points: Tensor, mask: Tensor) -> Tensor:
     """``points[mask]``, twice as fast."""
     return points.index_select(0, mask.nonzero().squeeze(1))
@@ -138,14 +156,19 @@ def concatenate_clusters(parts: list[Clusters]) -> Clusters:
 
 
 def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
-    """How many clusters each of the two classes gets.
+    """How many clusters each class gets: occupied, free and, where there are any, unknown points.
 
-    Half each, the odd one to the occupied class; a class that cannot fill its half (five points a
-    cluster) leaves the rest to the other.
+    By `class_shares`, what does not go round to the occupied class; a class that cannot fill its
+    share (five points a cluster) leaves the rest to the others.
     """
     room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
-    occupied = min(room[0], max(-(-num_clusters // 2), num_clusters - room[1]))
-    return [occupied, min(room[1], num_clusters - occupied)]
+    num_unknown = room[2] if len(room) > 2 else 0
+    shares = class_shares(num_unknown)
+    unknown = min(num_unknown, num_clusters * shares[2] // sum(shares))
+    known = num_clusters - unknown
+    fair = -(-known * shares[0] // (shares[0] + shares[1]))
+    occupied = min(room[0], max(fair, known - room[1]))
+    return [occupied, min(room[1], known - occupied), unknown][: len(room)]
 
 
 def scan_clusters(classes: list[Tensor]) -> list[int]:

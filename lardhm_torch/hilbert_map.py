@@ -9,8 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lardhm_torch import checkpoint, joining, map_state, native, uncertainty
-from lardhm_torch.clustering import Clusters, along_curve, cluster_classes, factor_covariances
+from lardhm_torch import checkpoint, joining, map_state, native, uncertainty, unseen
+from lardhm_torch.clustering import (
+    Clusters,
+    along_curve,
+    cluster_classes,
+    factor_covariances,
+    points_where,
+)
 from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.incremental import Task, UpdateConfig, updated
@@ -258,7 +264,7 @@ class LardHilbertMap(nn.Module):
 
         Args:
             points: (N, D) world positions [m].
-            labels: (N,) 1 occupied, 0 free; one class alone is allowed.
+            labels: (N,) 1 occupied, 0 free, 1/2 unknown; one class alone is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
                 leaves the rest to the other, and no cluster is starved of points. None: chosen
                 from the data (`clustering.choose_num_clusters`).
@@ -283,6 +289,7 @@ class LardHilbertMap(nn.Module):
         clusters, is_occupied = cluster_classes(local, labels, num_clusters, rng)
         learned = LardHilbertMap(**self.settings).to(self.centers)
         learned._grow(clusters, is_occupied, origin)
+        local, labels = learned._settle_unknown(local, labels, rng)
         learned._train_weights(local, labels, config or FitConfig(), rng, progress)
         self.load_state_dict(learned.state_dict())
         return self
@@ -412,6 +419,25 @@ class LardHilbertMap(nn.Module):
             {"params": [self.weights], "weight_decay": weight_decay},
             {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
         ]
+
+    def _settle_unknown(
+        self, local: Tensor, labels: Tensor, rng: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Where there are unknown points: less those inside surfaces, and more in the tails."""
+        is_unknown = labels == unseen.UNKNOWN
+        if not bool(is_unknown.any()):
+            return local, labels
+        known = Clusters(self.counts, self.means, self.scatters)
+        surfaces = Clusters(*(moments[self.is_occupied] for moments in known))
+        rows = is_unknown.nonzero().squeeze(1)
+        kept = ~is_unknown
+        kept[rows] = unseen.off_surfaces(local[rows], surfaces, self.min_lengthscale)
+        tails = unseen.draw_tails(known, self.min_lengthscale, rng)
+        held = self._nearest_features(tails)[1].amax(dim=1) > unseen.TAIL_FEATURE
+        tails = tails[~held]
+        local = torch.cat([points_where(local, kept), tails])
+        labels = torch.cat([labels[kept], labels.new_full((len(tails),), unseen.UNKNOWN)])
+        return along_curve(local, labels)
 
     def _train_weights(
         self, local: Tensor, labels: Tensor, config: FitConfig, rng: torch.Generator, progress: bool

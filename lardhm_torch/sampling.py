@@ -1,4 +1,4 @@
-"""Rays to training pairs: hits are occupied, points on the ray before them are free."""
+"""Rays to training pairs: hits are occupied, points on the ray before them free, behind unknown."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.scans import Scans
+from lardhm_torch.unseen import UNKNOWN, never_crossed
 
 CHECK_CHUNK = 1 << 18  # labels checked at a time: the check takes no memory to speak of
 
@@ -27,6 +28,8 @@ class SamplingConfig:
     near_samples: int = 2  # free samples close in front of each hit
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
+    behind_samples: int = 2  # unknown samples behind each hit, between the same two
+    cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range < self.max_range < float("inf"):
@@ -38,6 +41,11 @@ class SamplingConfig:
             raise ValueError(f"free_samples must be 1 or more; got {self.free_samples}")
         if self.near_samples < 0:
             raise ValueError(f"near_samples must be 0 or more; got {self.near_samples}")
+        if self.behind_samples < 0 or not self.cell_edge > 0:
+            raise ValueError(
+                "behind_samples must be 0 or more and cell_edge > 0; "
+                f"got {self.behind_samples} and {self.cell_edge}"
+            )
         if not 0 <= self.near_margin < self.near_reach:
             raise ValueError(
                 "near_margin and near_reach must satisfy 0 <= near_margin < near_reach; "
@@ -54,8 +62,8 @@ class Samples:
     """Training pairs, world frame.
 
     Args:
-        points: (N, D) float64 positions [m], the hits first.
-        labels: (N,) 1 occupied, 0 free.
+        points: (N, D) float64 positions [m], the hits first, then free ones, unknown ones last.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown: no ray was there.
         ray_id: (N,) which ray of the scans a point lies on.
         dropped: number of rays left out, by reason.
     """
@@ -91,12 +99,13 @@ def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str,
 
 
 def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
-    """Labelled points of the scans: every hit occupied, points on the ray before it free.
+    """Labelled points of the scans: hits occupied, points on the ray before them free, behind unknown.
 
     Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
     longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
-    returns of a pulse (``target_index`` > 1) give a hit but no free space.
+    returns of a pulse (``target_index`` > 1) give a hit but no free space. Behind each hit lie
+    ``behind_samples`` points of label 1/2, those of them where no other ray went.
 
     Args:
         scans: range scans, world frame.
@@ -145,7 +154,20 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
         ray_id[rows].view_as(depths).copy_(_taken(rays, members)[:, None])
     labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
-    return Samples(points, labels, ray_id, dropped)
+    known = Samples(points, labels, ray_id, dropped)
+    if not config.behind_samples:
+        return known
+    seen = torch.where(is_hit, free_end, reach)[first]
+    lines = (starts if len(starts) == 1 else _taken(starts, _rows(first)), _taken(ahead, _rows(first)))
+    behind = _depths_behind(len(hits), config, rng)
+    places = (_taken(scans.ends, hit_rays)[:, None] + behind * _taken(ahead, hits)[:, None]).flatten(0, 1)
+    unknown = _rows(never_crossed(places, *lines, seen, config.cell_edge))
+    return Samples(
+        torch.cat([points, _taken(places, unknown)]),
+        torch.cat([labels, labels.new_full((len(unknown),), UNKNOWN)]),
+        torch.cat([ray_id, hit_rays.repeat_interleave(config.behind_samples)[unknown]]),
+        dropped,
+    )
 
 
 def _stratified_depths(
@@ -168,6 +190,15 @@ def _near_depths(
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
     depths *= config.near_margin - config.near_reach
     return members, depths.add_(_taken(free_end, members)[:, None]).clamp_(min=0)
+
+
+def _depths_behind(count: int, config: SamplingConfig, rng: torch.Generator) -> Tensor:
+    """(count, behind_samples, 1) depths behind hits [m], as many at 0.2 to 0.4 m as at 0.4 to 0.8 m."""
+    shape = (count, config.behind_samples, 1)
+    share = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)
+    share += torch.arange(config.behind_samples, device=rng.device)[:, None]
+    low = max(config.near_margin, 1e-2 * config.near_reach)
+    return low * (config.near_reach / low) ** (share / config.behind_samples)
 
 
 def _rows(mask: Tensor) -> Tensor:
@@ -203,14 +234,21 @@ def check_samples(
             f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
             f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
         )
-    strange = next((c for c in labels.split(CHECK_CHUNK) if not _zeros_and_ones(c)), None)
+    strange = next((c for c in labels.split(CHECK_CHUNK) if not _are_labels(c)), None)
     if strange is not None:
-        value = strange[(strange != 0) & (strange != 1)][0].item()
+        wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
+        value = strange[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
+        raise ValueError(f"labels must be 0 or 1, or 1/2 where nothing is known; got {value}.{cure}")
     return points, labels
 
 
-def _zeros_and_ones(values: Tensor) -> bool:
-    """Whether no value is another: only 0, 1 and infinity are their own squares."""
-    return torch.equal(values * values, values) and bool(values.sum() <= len(values))
+def drop_unknown(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """The labelled points that are occupied or free: the same tensors where all are."""
+    known = labels != UNKNOWN
+    return (points, labels) if bool(known.all()) else (points[known], labels[known])
+
+
+def _are_labels(values: Tensor) -> bool:
+    """Whether no value is another: only 0, 1/2, 1 and infinity make y (2 y - 1) (y - 1) zero or NaN."""
+    return bool((values * (2 * values - 1) * (values - 1) == 0).all())
