@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lardhm_torch.files import replaced_file
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 STREAM_KEY = "_stream"  # beside a map's tensors: how much of a stream of scans is in it
 
 

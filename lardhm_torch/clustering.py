@@ -22,6 +22,8 @@ CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] of the cells that tell the two apar
 CELLS_PER_SCAN_CLUSTER = 1  # the same where more scans will follow: a single one shows less
 MAX_CHOSEN = 5000  # a class
 START_POINTS = 50  # a center, drawn at random, among which the start is chosen
+ITERATIONS = 20  # of k-means: t of Algorithm 1
+VOLUME_ITERATIONS = 5  # the same where clusters fill a volume beside an unknown one: they are many
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
@@ -57,18 +59,21 @@ class Clusters(Columns):
         return self.scatters / (self.counts - 1).clamp(min=1)[:, None, None]
 
 
-def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> Clusters:
+def cluster_points(
+    points: Tensor, num_clusters: int, rng: torch.Generator, iterations: int = ITERATIONS
+) -> Clusters:
     """At most ``num_clusters`` clusters of the points, none of fewer than five unless there are fewer.
 
     Args:
         points: (N, D) positions of one class [m], in the order of `z_order`.
         num_clusters: how many to look for; more than N / 5 means N / 5.
         rng: random state of the start and of the batches.
+        iterations: of k-means.
 
     Source: Guizilini & Ramos 2016, Algorithm 1, eq. (6), (7) and Section IV-B.
     """
     num_clusters = max(1, min(num_clusters, len(points) // MIN_COUNT))
-    centers = mini_batch_kmeans(points, num_clusters, rng)
+    centers = mini_batch_kmeans(points, num_clusters, rng, iterations=iterations)
     _, counts, sums, scatters = native.assign(points, centers)
     clusters = merge_small(clusters_about(centers, counts, sums, scatters))
     # Neighbors in space are neighbors in memory: queries of large maps are faster.
@@ -118,9 +123,12 @@ def cluster_each(
         totals: how many clusters of each to look for.
         rng: random state.
     """
+    with_unknown = len(classes) > 2 and len(classes[2]) > 0
+    rest = VOLUME_ITERATIONS if with_unknown else ITERATIONS
+    rounds = [ITERATIONS, rest, rest][: len(classes)]
     parts = [
-        cluster_points(members, total, rng)
-        for members, total in zip(classes, totals, strict=True)
+        cluster_points(members, total, rng, iterations)
+        for members, total, iterations in zip(classes, totals, rounds, strict=True)
         if len(members) and total
     ]
     clusters = concatenate_clusters(parts)
@@ -212,7 +220,7 @@ def mini_batch_kmeans(
     num_clusters: int,
     rng: torch.Generator,
     *,
-    iterations: int = 20,
+    iterations: int = ITERATIONS,
     batch_size: int | None = None,
     restart_every: int = 5,
 ) -> Tensor:

@@ -38,7 +38,7 @@ class FitConfig:
     # The occupied class's share where classes are balanced. More than half, because hits are few
     # and free points many: what is learned of hits carries over to unseen rays less surely.
     occupied_share: float = 0.6
-    unknown_share: float = 0.35  # of the unknown points' loss, beside the loss of the two classes
+    unknown_share: float = 0.25  # of the unknown points' loss, beside the loss of the two classes
 
     def rows_a_batch(self, num_points: int) -> int:
         """Points a step."""
@@ -102,7 +102,7 @@ def class_factors(free: Tensor, occupied: Tensor, occupied_share: float = 0.5) -
 
 
 def label_factors(
-    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.35
+    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
 ) -> Tensor:
     """(N,) labels -> (3,) loss factors of a free, an unknown and an occupied point, float64.
 
@@ -116,7 +116,7 @@ def label_factors(
 
 
 def balance_classes(
-    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.35
+    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
 ) -> Tensor:
     """(N,) labels -> (N,) loss factors, see `label_factors`."""
     factors = label_factors(labels, occupied_share, unknown_share).to(labels)

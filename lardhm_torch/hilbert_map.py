@@ -17,7 +17,14 @@ from lardhm_torch.clustering import (
     factor_covariances,
     points_where,
 )
-from lardhm_torch.features import Kernel, feature_matrix, kernel_factors, lard_kernel, raw_factors
+from lardhm_torch.features import (
+    Kernel,
+    feature_matrix,
+    kernel_factors,
+    lard_kernel,
+    neighbor_fade,
+    raw_factors,
+)
 from lardhm_torch.fitting import FitConfig, deal_samples, fit_weights
 from lardhm_torch.incremental import Task, UpdateConfig, updated
 from lardhm_torch.sampling import check_samples
@@ -144,6 +151,7 @@ class LardHilbertMap(nn.Module):
             local, self.centers, self.num_neighbors, self._fresh_index()
         )
         values = lard_kernel(local, self.centers, self.scale_tril, indices)
+        values = values * neighbor_fade(local, self.centers, indices)
         return feature_matrix(indices, values, len(self))
 
     def variance(self, points: Tensor) -> Tensor:
@@ -432,7 +440,7 @@ class LardHilbertMap(nn.Module):
         rows = is_unknown.nonzero().squeeze(1)
         kept = ~is_unknown
         kept[rows] = unseen.off_surfaces(local[rows], surfaces, self.min_lengthscale)
-        tails = unseen.draw_tails(known, self.min_lengthscale, rng)
+        tails = unseen.draw_tails(known, self.is_occupied, self.min_lengthscale, rng)
         held = self._nearest_features(tails)[1].amax(dim=1) > unseen.TAIL_FEATURE
         tails = tails[~held]
         local = torch.cat([points_where(local, kept), tails])

@@ -28,7 +28,7 @@ class SamplingConfig:
     near_samples: int = 2  # free samples close in front of each hit
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
-    behind_samples: int = 2  # unknown samples behind each hit, between the same two
+    behind_samples: int = 1  # unknown samples behind each hit, between the same two
     cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
 
     def __post_init__(self) -> None:

@@ -1,13 +1,11 @@
-"""Is a straight way free? Integrals of the map's log-odds along lines, in closed form.
+"""Is a straight way free? Integrals of the map's log-odds along lines.
 
 Obstacles are met at a rate, the hazard lambda(x) = max(log-odds(x), 0) / length [1/m], as in a Poisson
 process: the way from a to b is free with probability exp(-integral of lambda from a to b). Where the
 map says "free" or "unknown" nothing is met; ask `exploring` what is unknown.
 
-Where the k nearest clusters stay the same, log-odds along a line are a sum of Gaussians of the way,
-each with an error function as its integral. The places with the same k nearest are convex, so equal
-neighbors at both ends of an interval mean equal neighbors all along it: the line is cut until that
-is so.
+Log-odds along a line are smooth, for neighbors fade out before they are replaced: Gauss-Legendre
+quadrature of a few points a step is as good as exact, between the places where they change sign.
 """
 
 from __future__ import annotations
@@ -18,17 +16,16 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
+from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 
-from lardhm_torch.native import nearest_centers
 from lardhm_torch.querying import local_parts
 from lardhm_torch.rays import check_rays, unit_rays
 from lardhm_torch.surface import surface_step
 
 HAZARD_LENGTH = 0.1  # [m] over which log-odds count once
-SHORTEST = (
-    1e-6  # [m] no interval is cut below this: what is left out is no more than the jump times it
-)
+SHORTEST = 1e-6  # [m] so sharp are the places found where log-odds are 0
+NODES = 5  # of the quadrature, an interval
 SEGMENTS_AT_ONCE = 1 << 16
 
 
@@ -51,14 +48,12 @@ class Mover:
 
 
 class _Intervals(NamedTuple):
-    """I pieces of segments: their number (I,), first and last share of the way (I,), and at both
-    ends the k nearest clusters (I, K) and whether log-odds are above 0 (I,)."""
+    """I pieces of segments: their number (I,), first and last share of the way (I,), and whether
+    log-odds are above 0 at both ends (I,)."""
 
     segment: Tensor
     first: Tensor
     last: Tensor
-    near_first: Tensor
-    near_last: Tensor
     above_first: Tensor
     above_last: Tensor
 
@@ -71,16 +66,10 @@ def hazard(model: Any, points: Tensor, *, length: float = HAZARD_LENGTH) -> Tens
 def segment_hazard(model: Any, starts: Tensor, ends: Tensor, mover: Mover | None = None) -> Tensor:
     """Number of obstacles that a mover expects to meet on straight ways; differentiable.
 
-    The integral of the `hazard` along each way. With z = inv(L) (a - c) and u = inv(L) (b - a) a
-    kernel on the way from a to b is exp(-|z + s u|^2 / 2), s from 0 to 1, and its integral over s is
-
-        exp(-|z + m u|^2 / 2) sqrt(pi / 2) / |u| (erf(|u| (1 - m) / sqrt 2) + erf(|u| m / sqrt 2))
-
-    with its middle at m = -z u / |u|^2. Gradients take the neighbors as they are, like those of the map.
-
-    For a point this is exact, but for obstacles thinner than a step. A sphere sweeps the ways of all
+    The integral of the `hazard` along each way, by `NODES` points an interval of at most a step.
+    Obstacles thinner than a step can be missed. A sphere sweeps the ways of all
     its points, and the worst of them counts; it is looked for among the center and 3^D - 1 points
-    spread over the surface, each exact, so the result is a bound from below. `bounding.clearance`
+    spread over the surface, so the result is a bound from below. `bounding.clearance`
     is one from the other side: where it is nowhere below the radius, the sphere meets nothing.
 
     Args:
@@ -194,16 +183,9 @@ def _ball(dim: int, radius: float) -> Tensor:
     return radius * (corners / lengths).double()
 
 
-def _nearest(model: Any, points: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, K) clusters that answer for (N, D) points, and (N,) whether log-odds are above 0."""
-    local = (points - model.origin).to(model.centers.dtype)
-    k = getattr(model, "num_neighbors", len(model.centers))
-    return nearest_centers(local, model.centers.detach(), k), model.log_odds(points) > 0
-
-
 @torch.no_grad()
 def _cut(model: Any, starts: Tensor, ends: Tensor, step: float) -> _Intervals:
-    """The intervals with log-odds above 0, each with one set of neighbors."""
+    """The intervals with log-odds above 0, none longer than a step."""
     ways = ends - starts
     meters = torch.linalg.vector_norm(ways, dim=1)
     counts = (meters / step).ceil().long()  # none for a way of length 0
@@ -212,22 +194,21 @@ def _cut(model: Any, starts: Tensor, ends: Tensor, step: float) -> _Intervals:
     number = number - (counts.cumsum(0) - counts)[segment]
     first, last = number / counts[segment], (number + 1) / counts[segment]
 
-    def at(which: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-        return _nearest(model, starts[which] + share[:, None].double() * ways[which])
+    def above(which: Tensor, share: Tensor) -> Tensor:
+        return model.log_odds(starts[which] + share[:, None].double() * ways[which]) > 0
 
-    (near, above), (near_last, above_last) = at(segment, first.double()), at(segment, last.double())
-    pieces = _Intervals(segment, first.double(), last.double(), near, near_last, above, above_last)
-    done = [_select(pieces, torch.zeros_like(above))]
+    ends_above = above(segment, first.double()), above(segment, last.double())
+    pieces = _Intervals(segment, first.double(), last.double(), *ends_above)
+    done = [_select(pieces, torch.zeros_like(pieces.above_last))]
     while len(pieces.segment):
-        whole = (pieces.near_first == pieces.near_last).all(dim=1)
-        whole &= pieces.above_first == pieces.above_last
+        whole = pieces.above_first == pieces.above_last
         whole |= (pieces.last - pieces.first) * meters[pieces.segment] < SHORTEST
         done.append(_select(pieces, whole & pieces.above_last))
         rest = _select(pieces, ~whole)
         middle = (rest.first + rest.last) / 2
-        near, above = at(rest.segment, middle)
-        left = rest._replace(last=middle, near_last=near, above_last=above)
-        right = rest._replace(first=middle, near_first=near, above_first=above)
+        at_middle = above(rest.segment, middle)
+        left = rest._replace(last=middle, above_last=at_middle)
+        right = rest._replace(first=middle, above_first=at_middle)
         pieces = _Intervals(*(torch.cat(pair) for pair in zip(left, right, strict=True)))
     return _Intervals(*(torch.cat(parts) for parts in zip(*done, strict=True)))
 
@@ -238,21 +219,12 @@ def _select(pieces: _Intervals, mask: Tensor) -> _Intervals:
 
 def _integrate(model: Any, starts: Tensor, ends: Tensor, pieces: _Intervals) -> Tensor:
     """(S,) integral of the log-odds over all intervals of each segment [m]."""
-    rows, near = pieces.segment, pieces.near_last
+    rows = pieces.segment
     way = ends[rows] - starts[rows]
     start = starts[rows] + pieces.first[:, None] * way
     way = (pieces.last - pieces.first)[:, None] * way
-    factors = model.scale_tril.double()
-    eye = torch.eye(model.dim, dtype=torch.float64, device=factors.device)
-    whiten = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)[near]
-    offsets = start[:, None] - (model.centers.double() + model.origin)[near]  # (I, K, D)
-    z = (whiten @ offsets[..., None]).squeeze(-1)
-    u = (whiten @ way[:, None, :, None]).squeeze(-1)
-    squared = u.square().sum(dim=-1)
-    middle = -(z * u).sum(dim=-1) / squared
-    peak = torch.exp(-0.5 * (z + middle[..., None] * u).square().sum(dim=-1))
-    scale = squared.sqrt() / math.sqrt(2)
-    bell = torch.erf(scale * (1 - middle)) + torch.erf(scale * middle)
-    values = model.weights.double()[near] * peak * bell * (math.sqrt(math.pi) / 2) / scale
+    nodes, shares = (torch.from_numpy(x).to(starts.device) for x in leggauss(NODES))
+    points = start[:, None] + (0.5 + 0.5 * nodes[:, None]) * way[:, None]  # (I, NODES, D)
+    values = (model.log_odds(points).double() * shares).sum(dim=1) / 2
     meters = torch.linalg.vector_norm(way, dim=1)
-    return starts.new_zeros(len(starts)).index_add(0, rows, values.sum(dim=1) * meters)
+    return starts.new_zeros(len(starts)).index_add(0, rows, values * meters)

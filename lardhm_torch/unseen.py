@@ -19,11 +19,11 @@ from lardhm_torch.clustering import Clusters, factor_covariances
 UNKNOWN = 0.5  # the label
 TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
 PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
-INSIDE = 3.0  # standard deviations from a surface's cluster: nothing there is unknown ...
-SURFACE = 0.15  # [m] ... nor farther than this from its plane: wider clusters are no surfaces
+INSIDE = 6.0  # standard deviations from a surface's cluster: nothing there is unknown ...
+SURFACE = 0.25  # [m] ... nor farther than this from its plane: wider clusters are no surfaces
 TAILS = (2.0, 5.0)  # standard deviations from a cluster: where its tail is
 TAIL_FEATURE = 0.4  # no cluster holds a place where no feature is larger
-TAILS_PER_CLUSTER = 2
+TAILS_PER_CLUSTER = 3
 
 
 def table_entry(cells: Tensor) -> Tensor:
@@ -87,15 +87,21 @@ def off_surfaces(points: Tensor, surfaces: Clusters, floor: float) -> Tensor:
     return ~(inside & ((offsets * normals[owner]).sum(dim=1).abs() < SURFACE))
 
 
-def draw_tails(clusters: Clusters, floor: float, rng: torch.Generator) -> Tensor:
+def draw_tails(
+    clusters: Clusters, is_occupied: Tensor, floor: float, rng: torch.Generator
+) -> Tensor:
     """(N, D) positions in the tails of the clusters [m], more where these are large.
 
-    Places are spread over space, not over clusters: a cluster is drawn as often as its volume says.
+    Places are spread over space, not over clusters: a cluster is drawn as often as its volume says,
+    half of them from the occupied ones, which are smaller.
     """
     count, dim = TAILS_PER_CLUSTER * len(clusters), clusters.means.shape[1]
     covariances = clusters.covariances
     sizes = covariances.diagonal(dim1=1, dim2=2).sum(dim=1).sqrt() + floor
-    chosen = torch.multinomial(sizes**dim, count, replacement=True, generator=rng)
+    volumes = sizes**dim
+    for kind in (is_occupied, ~is_occupied):
+        volumes[kind] /= volumes[kind].sum()
+    chosen = torch.multinomial(volumes, count, replacement=True, generator=rng)
     factors = factor_covariances(covariances, floor)[chosen]
     shape = (count, dim)
     way = torch.randn(shape, generator=rng, device=rng.device).to(factors)

@@ -46,6 +46,14 @@ inline typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
   return exp_of<T>(squared * T(-0.5));
 }
 
+// Its derivative by t.
+template <class T>
+inline typename Simd<T>::V fade_slope(typename Simd<T>::V t) {
+  using V = typename Simd<T>::V;
+  const V u = (T(1) - t) * T(1 / kFading);
+  return u > 0 ? (u < T(1) ? u * (u - T(1)) * T(6 / kFading) : V{}) : V{};
+}
+
 // A packet's kernel values of one cluster, faded.
 template <class T, int D>
 inline typename Simd<T>::V feature_of(const Packet<T, D>& packet, const T* center,
