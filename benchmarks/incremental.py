@@ -36,7 +36,7 @@ from lardhm_torch import (
     stream_scans,
 )
 from lardhm_torch.baselines.octomap import new_tree, to_array
-from lardhm_torch.clustering import along_curve, cluster_each, split_classes
+from lardhm_torch.clustering import along_curve, cluster_each, split_labels
 from lardhm_torch.metrics import evaluate, protocol_rays
 from lardhm_torch.streaming import real_time
 
@@ -74,7 +74,7 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
     origin = samples.points.mean(dim=0).round()
     local = (samples.points - origin).float()
     local, labels = along_curve(local, samples.labels)
-    clusters = cluster_each(split_classes(local, labels > 0.5), (occupied, free), rng)
+    clusters = cluster_each(split_labels(local, labels)[:2], (occupied, free), rng)
     model._grow(*clusters, origin)
     model._train_weights(local, labels, FitConfig(), rng, False)
     return model

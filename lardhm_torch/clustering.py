@@ -125,12 +125,11 @@ def cluster_each(
     """
     with_unknown = len(classes) > 2 and len(classes[2]) > 0
     rest = VOLUME_ITERATIONS if with_unknown else ITERATIONS
-    rounds = [ITERATIONS, rest, rest][: len(classes)]
-    parts = [
-        cluster_points(members, total, rng, iterations)
-        for members, total, iterations in zip(classes, totals, rounds, strict=True)
-        if len(members) and total
-    ]
+    parts = []
+    for number, (members, total) in enumerate(zip(classes, totals, strict=True)):
+        if len(members) and total:
+            found = cluster_points(members, total, rng, rest if number else ITERATIONS)
+            parts.append(of_unknown(found) if number == 2 else found)
     clusters = concatenate_clusters(parts)
     is_occupied = torch.zeros_like(clusters.counts, dtype=torch.bool)
     is_occupied[: len(parts[0]) if len(classes[0]) else 0] = True
@@ -151,6 +150,11 @@ def split_labels(points: Tensor, labels: Tensor) -> list[Tensor]:
     if bool((labels != 0.5).all()):
         return [occupied, rest, rest[:0]]
     return [occupied, points_where(points, labels < 0.5), points_where(points, labels == 0.5)]
+
+
+def of_unknown(clusters: Clusters) -> Clusters:
+    """Clusters of unknown points: as wide, but they count nothing, and all that is seen replaces them."""
+    return Clusters(torch.zeros_like(clusters.counts), clusters.means, clusters.covariances)
 
 
 def points_where(points: Tensor, mask: Tensor) -> Tensor:

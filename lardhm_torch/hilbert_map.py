@@ -51,7 +51,8 @@ class LardHilbertMap(nn.Module):
         centers: (M, D) parameter [m], map frame.
         raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with the logarithm of their
             diagonals: any value is a valid factor. `scale_tril` is the kernel's.
-        is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters.
+        is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
+            those of unknown points count 0, for nothing was seen there.
         posterior_means, posterior_variances: (M,) buffers, the weights as `fit_uncertainty` knows
             them; variance 0 for clusters that it has not seen.
         posterior_scales: (2,) buffer, factors on negative and on positive posterior log-odds.
@@ -171,6 +172,25 @@ class LardHilbertMap(nn.Module):
         mean, variance = self._posterior(points)
         return uncertainty.moderate(mean, uncertainty.OWN_SHARE * variance)
 
+    @torch.no_grad()
+    def unknown(self, points: Tensor) -> Tensor:
+        """(..., D) world positions [m] -> (...) how little the map has seen there, 0 to 1.
+
+        1 less the largest feature of a cluster that holds occupied or free points. A probability
+        near 1/2 means contradiction where this is near 0, and that nothing was seen where it is
+        near 1. Nothing but `fit` is needed.
+        """
+        local = self._to_map_frame(points)
+        parts = [local.new_ones(0)]
+        for chunk in local.reshape(-1, self.dim).split(uncertainty.QUERY_CHUNK):
+            if len(self) == 0:
+                parts.append(torch.ones_like(chunk[:, 0]))
+                continue
+            indices, values = self._nearest_features(chunk)
+            seen = torch.where(self.counts[indices] > 0, values, 0 * values)
+            parts.append(1 - seen.amax(dim=1))
+        return torch.cat(parts).reshape(local.shape[:-1])
+
     def _posterior(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the log-odds at (..., D) points."""
         if not bool((self.posterior_variances > 0).all()) or len(self) == 0:
@@ -288,7 +308,8 @@ class LardHilbertMap(nn.Module):
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
-        points, labels = check_samples(points, labels, self.dim, self.origin.device)
+        device = self.origin.device
+        points, labels = check_samples(points, labels, self.dim, device, keep_unknown=True)
         _check_num_clusters(num_clusters)
         dtype = self.centers.dtype
         rng = torch.Generator(device=points.device).manual_seed(seed)

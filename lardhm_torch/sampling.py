@@ -1,8 +1,9 @@
-"""Rays to training pairs: hits are occupied, points on the ray before them free, behind unknown."""
+"""Rays to training pairs: hits are occupied, points before them free, points behind unknown."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -99,7 +100,7 @@ def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str,
 
 
 def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
-    """Labelled points of the scans: hits occupied, points on the ray before them free, behind unknown.
+    """Labelled points of the scans: hits occupied, points before them free, behind them unknown.
 
     Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
@@ -157,16 +158,44 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     known = Samples(points, labels, ray_id, dropped)
     if not config.behind_samples:
         return known
-    seen = torch.where(is_hit, free_end, reach)[first]
-    lines = (starts if len(starts) == 1 else _taken(starts, _rows(first)), _taken(ahead, _rows(first)))
-    behind = _depths_behind(len(hits), config, rng)
-    places = (_taken(scans.ends, hit_rays)[:, None] + behind * _taken(ahead, hits)[:, None]).flatten(0, 1)
-    unknown = _rows(never_crossed(places, *lines, seen, config.cell_edge))
+    seen = _rows(first)
+    lines = _Lines(
+        starts if len(starts) == 1 else _taken(starts, seen),
+        _taken(ahead, seen),
+        _taken(torch.where(is_hit, free_end, reach), seen),
+    )
+    return _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+
+
+class _Lines(NamedTuple):
+    """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
+
+    starts: Tensor
+    ahead: Tensor
+    reach: Tensor
+
+
+def _with_unknown(
+    known: Samples, ahead: Tensor, lines: _Lines, config: SamplingConfig, rng: torch.Generator
+) -> Samples:
+    """The samples and, after them, unknown points behind the hits, where no ray went.
+
+    Args:
+        known: occupied and free samples, the H hits first.
+        ahead: (H, D) directions of the hits' rays.
+        lines: all rays.
+        config: how many, how deep.
+        rng: random state.
+    """
+    count = config.behind_samples
+    depths = _depths_behind(len(ahead), config, rng)
+    places = (known.points[: len(ahead), None] + depths * ahead[:, None]).flatten(0, 1)
+    rows = _rows(never_crossed(places, *lines, config.cell_edge))
     return Samples(
-        torch.cat([points, _taken(places, unknown)]),
-        torch.cat([labels, labels.new_full((len(unknown),), UNKNOWN)]),
-        torch.cat([ray_id, hit_rays.repeat_interleave(config.behind_samples)[unknown]]),
-        dropped,
+        torch.cat([known.points, _taken(places, rows)]),
+        torch.cat([known.labels, known.labels.new_full((len(rows),), UNKNOWN)]),
+        torch.cat([known.ray_id, known.ray_id[: len(ahead)].repeat_interleave(count)[rows]]),
+        known.dropped,
     )
 
 
@@ -193,7 +222,7 @@ def _near_depths(
 
 
 def _depths_behind(count: int, config: SamplingConfig, rng: torch.Generator) -> Tensor:
-    """(count, behind_samples, 1) depths behind hits [m], as many at 0.2 to 0.4 m as at 0.4 to 0.8 m."""
+    """(count, behind_samples, 1) depths behind hits [m], log-uniform from near_margin to near_reach."""
     shape = (count, config.behind_samples, 1)
     share = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)
     share += torch.arange(config.behind_samples, device=rng.device)[:, None]
@@ -214,9 +243,12 @@ def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
 
 
 def check_samples(
-    points: Tensor, labels: Tensor, dim: int, device: torch.device
+    points: Tensor, labels: Tensor, dim: int, device: torch.device, *, keep_unknown: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not."""
+    """Training pairs as (N, D) points and (N,) labels, or a ValueError that says why not.
+
+    Unknown points, label 1/2, are left out unless they are asked for.
+    """
     points = torch.as_tensor(points, device=device).detach()
     labels = torch.as_tensor(labels, device=device).detach()
     if points.ndim != 2 or points.shape[1] != dim:
@@ -239,14 +271,15 @@ def check_samples(
         wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
         value = strange[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(f"labels must be 0 or 1, or 1/2 where nothing is known; got {value}.{cure}")
-    return points, labels
-
-
-def drop_unknown(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """The labelled points that are occupied or free: the same tensors where all are."""
+        raise ValueError(
+            f"labels must be 0 or 1, or 1/2 where nothing is known; got {value}.{cure}"
+        )
     known = labels != UNKNOWN
-    return (points, labels) if bool(known.all()) else (points[known], labels[known])
+    if keep_unknown or bool(known.all()):
+        return points, labels
+    if not bool(known.any()):
+        raise ValueError("labels must be 0 or 1 somewhere; all are 1/2, unknown")
+    return points[known], labels[known]
 
 
 def _are_labels(values: Tensor) -> bool:

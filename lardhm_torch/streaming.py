@@ -160,7 +160,10 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         rows = torch.randint(len(scan), (config.max_rays,), generator=rng, device=rng.device)
         scan = scan.select(rows)
     try:
-        samples = sample_rays(scan, config.sampling, seed=seed)
+        sampling = config.sampling
+        if len(model):  # `update` learns nothing from unknown points
+            sampling = replace(sampling, behind_samples=0)
+        samples = sample_rays(scan, sampling, seed=seed)
     except NoUsableRayError as error:
         warnings.warn(f"scan {number} was passed over: no usable ray; {error}", stacklevel=3)
         return

@@ -97,7 +97,9 @@ def fine_tune(
 def _check(
     model: LardHilbertMap, points: Tensor, labels: Tensor, ray_id: Tensor | None
 ) -> LabelledPoints:
-    points, labels = check_samples(points, labels, model.dim, model.origin.device)
+    points, labels = check_samples(
+        points, labels, model.dim, model.origin.device, keep_unknown=True
+    )
     if ray_id is not None:
         ray_id = torch.as_tensor(ray_id, device=points.device)
         if ray_id.shape != labels.shape:

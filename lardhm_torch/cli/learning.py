@@ -63,11 +63,8 @@ def fit(arguments: argparse.Namespace) -> None:
             progress=True,
         )
     model.save(arguments.output)
-    hits = int(samples.labels.sum())
-    print(
-        f"{hits} hits and {len(samples) - hits} free points -> {len(model)} clusters "
-        f"-> {arguments.output}"
-    )
+    hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
+    print(f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}")
 
 
 def _fit_incrementally(arguments: argparse.Namespace) -> None:
