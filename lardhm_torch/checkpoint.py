@@ -78,10 +78,12 @@ def check_settings(extra: Any) -> dict[str, Any]:
     settings = dict(extra)
     version = settings.pop("format_version")
     if version != FORMAT_VERSION:
-        raise ValueError(
-            f"format_version must be {FORMAT_VERSION}; got {version}. "
+        cure = (
             "A newer map needs a newer lardhm_torch"
+            if version > FORMAT_VERSION
+            else "Neighbors of older maps do not fade: fit the map again"
         )
+        raise ValueError(f"format_version must be {FORMAT_VERSION}; got {version}. {cure}")
     return settings
 
 

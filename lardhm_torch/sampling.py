@@ -271,9 +271,7 @@ def check_samples(
         wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
         value = strange[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(
-            f"labels must be 0 or 1, or 1/2 where nothing is known; got {value}.{cure}"
-        )
+        raise ValueError(f"labels must be 0 or 1; got {value}. 1/2 stands for unknown.{cure}")
     known = labels != UNKNOWN
     if keep_unknown or bool(known.all()):
         return points, labels
@@ -283,5 +281,5 @@ def check_samples(
 
 
 def _are_labels(values: Tensor) -> bool:
-    """Whether no value is another: only 0, 1/2, 1 and infinity make y (2 y - 1) (y - 1) zero or NaN."""
+    """Whether no value is another: y (2 y - 1) (y - 1) is 0 at these alone."""
     return bool((values * (2 * values - 1) * (values - 1) == 0).all())
