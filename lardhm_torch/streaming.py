@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from lardhm_torch import checkpoint
-from lardhm_torch.clustering import scan_clusters, split_classes
+from lardhm_torch.clustering import scan_clusters, split_labels
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.incremental import UpdateConfig
 from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
@@ -176,6 +176,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
 def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
     if config.max_clusters is None:
         return config.num_clusters
-    classes = split_classes(samples.points, samples.labels > 0.5)
-    chosen = config.num_clusters or sum(scan_clusters(classes))
-    return min(chosen, config.max_clusters)
+    *classes, unknown = split_labels(samples.points, samples.labels)
+    shares = 2 if len(unknown) else 1  # free space beside the unknown takes as many again
+    chosen = config.num_clusters or shares * sum(scan_clusters(classes))
+    return config.num_clusters if chosen <= config.max_clusters else config.max_clusters
