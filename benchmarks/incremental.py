@@ -37,7 +37,7 @@ from lardhm_torch import (
 )
 from lardhm_torch.evaluation.baselines.octomap import new_tree, to_array
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
-from lardhm_torch.learning.clustering import cluster_each, split_classes
+from lardhm_torch.learning.clustering import cluster_each, split_labels
 from lardhm_torch.points import in_morton_order
 from lardhm_torch.streaming import real_time
 
@@ -75,7 +75,7 @@ def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
     origin = samples.points.mean(dim=0).round()
     local = (samples.points - origin).float()
     local, labels = in_morton_order(local, samples.labels)
-    clusters = cluster_each(split_classes(local, labels > 0.5), (occupied, free), rng)
+    clusters = cluster_each(split_labels(local, labels)[:2], (occupied, free), rng)
     model._grow(*clusters, origin)
     model._train_weights(local, labels, FitConfig(), rng, False)
     return model

@@ -14,6 +14,7 @@ from torch import Tensor
 CHUNK_ENTRIES = 1 << 23  # distances held at a time by the exhaustive search
 KDTREE_MIN_CENTERS = 64  # below this the exhaustive search is as fast
 QUERY_CHUNK = 1 << 17  # points whose features are held at a time by a query
+FADING = 0.5  # of the k-th neighbor's squared distance: over so much of it neighbors fade out
 SPARE_CANDIDATES = 4  # neighbors asked beyond k, so that ties can be settled
 
 
@@ -180,15 +181,43 @@ def lard_kernel(points: Tensor, centers: Tensor, scale_tril: Tensor, indices: Te
     return torch.exp(-0.5 * squared)
 
 
+def neighbor_fade(points: Tensor, centers: Tensor, indices: Tensor) -> Tensor:
+    """How much of each neighbor's kernel is left: 1 near the point, 0 for the farthest of the k.
+
+    With t the neighbor's squared distance over that of the farthest, u = (1 - t) / FADING, at most
+    1, and 3 u^2 - 2 u^3 is left. So a neighbor has faded out by the time that another takes its
+    place, and neither features nor their slopes jump. The paper drops neighbors with their kernels
+    open (Section II-B), and the probability jumps where it does.
+
+    Nothing fades where all clusters answer everywhere, or only one.
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m].
+        indices: (N, K) the K nearest clusters of each point.
+
+    Returns:
+        (N, K) factors in [0, 1], no unit.
+    """
+    squared = squared_distances(points[:, None], centers[indices])
+    if not 1 < indices.shape[1] < len(centers):
+        return torch.ones_like(squared)
+    tiny = torch.finfo(squared.dtype).tiny
+    left = 1 - squared / (squared.amax(dim=1, keepdim=True) + tiny)
+    left = (left / FADING).clamp(max=1)
+    return left.square() * (3 - 2 * left)
+
+
 def nearest_features(
     points: Tensor, centers: Tensor, scale_tril: Tensor, num_neighbors: int
 ) -> tuple[Tensor, Tensor]:
-    """(N, K) indices of the nearest clusters, ascending, and (N, K) their kernel values.
+    """(N, K) indices of the nearest clusters, ascending, and (N, K) their faded kernel values.
 
     Source: Guizilini & Ramos 2016, eq. (9) with Section II-B: all other values are zero.
     """
     indices = nearest_centers(points, centers, num_neighbors)
-    return indices, lard_kernel(points, centers, scale_tril, indices)
+    values = lard_kernel(points, centers, scale_tril, indices)
+    return indices, values * neighbor_fade(points, centers, indices)
 
 
 def feature_matrix(indices: Tensor, values: Tensor, num_clusters: int) -> Tensor:

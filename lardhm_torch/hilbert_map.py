@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import Kernel, feature_matrix, lard_kernel
+from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import map_merging, parameters, posterior
 from lardhm_torch.learning.clustering import check_num_clusters
@@ -43,7 +43,8 @@ class LardHilbertMap(parameters.MapParameters):
         centers: (M, D) parameter [m], map frame.
         raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with the logarithm of their
             diagonals: any value is a valid factor. `scale_tril` is the kernel's.
-        is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters.
+        is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
+            clusters of unknown points have count 0.
         posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; variance
             0 for clusters that it has not seen.
         posterior_scales: (2,) buffer, factors on negative and on positive posterior log-odds.
@@ -71,6 +72,7 @@ class LardHilbertMap(parameters.MapParameters):
             local, self.centers, self.num_neighbors, self._fresh_index()
         )
         values = lard_kernel(local, self.centers, self.scale_tril, indices)
+        values = values * neighbor_fade(local, self.centers, indices)
         return feature_matrix(indices, values, len(self))
 
     def variance(self, points: TensorLike) -> Tensor:
@@ -89,6 +91,24 @@ class LardHilbertMap(parameters.MapParameters):
         """
         mean, variance = self._posterior(points)
         return posterior.moderate(mean, posterior.OWN_SHARE * variance)
+
+    @torch.no_grad()
+    def unknown(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (...) how little was seen there, from 0 to 1.
+
+        1 minus the largest feature of a cluster of occupied or free points. Where the probability is
+        near 1/2, a value near 0 means contradictory data and a value near 1 means no data.
+        """
+        local = self._to_map_frame(points)
+        flat = local.reshape(-1, self.dim)
+        if len(self) == 0:
+            return torch.ones_like(flat[:, 0]).reshape(local.shape[:-1])
+        parts = [flat.new_ones(0)]
+        for chunk in flat.split(posterior.QUERY_CHUNK):
+            indices, values = self._nearest_features(chunk)
+            seen = torch.where(self.counts[indices] > 0, values, 0 * values)  # NaN stays NaN
+            parts.append(1 - seen.amax(dim=1))
+        return torch.cat(parts).reshape(local.shape[:-1])
 
     @torch.no_grad()
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
@@ -193,7 +213,7 @@ class LardHilbertMap(parameters.MapParameters):
 
         Args:
             points: (N, D) world positions [m].
-            labels: (N,) 1 occupied, 0 free; one class alone is allowed.
+            labels: (N,) 1 occupied, 0 free, 1/2 unknown; one class alone is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
                 leaves the rest to the other. None: chosen from the data
                 (`clustering.choose_num_clusters`).

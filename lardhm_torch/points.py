@@ -13,6 +13,7 @@ from lardhm_torch import native
 from lardhm_torch.maps import TensorLike, to_tensor
 
 CHECK_CHUNK = 1 << 18  # labels checked at a time, so that the check needs little memory
+UNKNOWN = 0.5  # label of a point where no ray was
 FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
 
 
@@ -31,7 +32,7 @@ def training_points(
 
     Args:
         points: (N, D) world positions [m], at least one.
-        labels: (N,) 1 occupied, 0 free.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown; unknown points serve a new map only.
         like: (M, D) tensor of the map, for its dimension, dtype and device.
         origin: (D,) float64, the map's origin [m]. None: a new frame around the points, in whole
             meters, with the points sorted along the Morton curve.
@@ -39,7 +40,9 @@ def training_points(
     Raises:
         ValueError: as `check_samples`.
     """
-    points, labels = check_samples(points, labels, like.shape[1], like.device)
+    points, labels = check_samples(
+        points, labels, like.shape[1], like.device, keep_unknown=origin is None
+    )
     labels = labels.to(like.dtype)
     if origin is not None:
         return TrainingPoints(to_map_frame(points, origin, like.dtype), labels, origin)
@@ -50,12 +53,20 @@ def training_points(
 
 
 def check_samples(
-    points: TensorLike, labels: TensorLike, dim: int, device: torch.device
+    points: TensorLike,
+    labels: TensorLike,
+    dim: int,
+    device: torch.device,
+    *,
+    keep_unknown: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Samples as (N, D) points and (N,) labels on a device; arrays and lists are converted.
 
+    Unknown points, of label 1/2, are left out unless ``keep_unknown`` asks for them.
+
     Raises:
-        ValueError: wrong shapes, no points, NaN or infinite points, or labels not 0 or 1.
+        ValueError: wrong shapes, no points, NaN or infinite points, labels not 0, 1/2 or 1, or
+            nothing but unknown points.
     """
     points, labels = (
         as_tensor(values, name, device).detach()
@@ -76,17 +87,23 @@ def check_samples(
             f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
             f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
         )
-    strange = next((c for c in labels.split(CHECK_CHUNK) if not _zeros_and_ones(c)), None)
+    strange = next((c for c in labels.split(CHECK_CHUNK) if not _are_labels(c)), None)
     if strange is not None:
-        value = strange[(strange != 0) & (strange != 1)][0].item()
+        wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
+        value = strange[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(f"labels must be 0 or 1; got {value}.{cure}")
-    return points, labels
+        raise ValueError(f"labels must be 0 or 1, or 1/2 where no ray was; got {value}.{cure}")
+    known = labels != UNKNOWN
+    if keep_unknown or bool(known.all()):
+        return points, labels
+    if not bool(known.any()):
+        raise ValueError("labels must hold 0 or 1; all are 1/2 (unknown)")
+    return points[known], labels[known]
 
 
-def _zeros_and_ones(values: Tensor) -> bool:
-    """Whether all values are 0 or 1: only 0, 1 and infinity equal their square."""
-    return torch.equal(values * values, values) and bool(values.sum() <= len(values))
+def _are_labels(values: Tensor) -> bool:
+    """Whether all values are 0, 1/2 or 1: the zeros of y (2 y - 1) (y - 1)."""
+    return bool((values * (2 * values - 1) * (values - 1) == 0).all())
 
 
 def in_morton_order(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:

@@ -1,14 +1,19 @@
-"""Rays to training pairs: hits are occupied, points on the ray before them are free."""
+"""Rays to training pairs: hits are occupied, points before them free, points behind unknown."""
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lardhm_torch.points import UNKNOWN
 from lardhm_torch.scans import Scans
+
+TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
+PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +31,8 @@ class SamplingConfig:
     near_samples: int = 2  # free samples close in front of each hit
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
+    behind_samples: int = 1  # unknown samples behind each hit, between the same two
+    cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range < self.max_range < float("inf"):
@@ -37,6 +44,11 @@ class SamplingConfig:
             raise ValueError(f"free_samples must be 1 or more; got {self.free_samples}")
         if self.near_samples < 0:
             raise ValueError(f"near_samples must be 0 or more; got {self.near_samples}")
+        if self.behind_samples < 0 or not self.cell_edge > 0:
+            raise ValueError(
+                "behind_samples must be 0 or more and cell_edge > 0; "
+                f"got {self.behind_samples} and {self.cell_edge}"
+            )
         if not 0 <= self.near_margin < self.near_reach:
             raise ValueError(
                 "near_margin and near_reach must satisfy 0 <= near_margin < near_reach; "
@@ -53,8 +65,8 @@ class Samples:
     """Training pairs, world frame.
 
     Args:
-        points: (N, D) float64 positions [m], the hits first.
-        labels: (N,) 1 occupied, 0 free.
+        points: (N, D) float64 positions [m], the hits first, then free ones, unknown ones last.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown: no ray was there.
         ray_id: (N,) which ray of the scans a point lies on.
         dropped: number of rays left out, by reason.
     """
@@ -98,12 +110,13 @@ def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str,
 
 
 def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
-    """Labelled points of the scans: every hit occupied, points on the ray before it free.
+    """Labelled points of the scans: hits occupied, points before them free, behind them unknown.
 
     Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
     longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
-    returns of a pulse (``target_index`` > 1) give a hit but no free space.
+    returns of a pulse (``target_index`` > 1) give a hit but no free space. Behind each hit lie
+    ``behind_samples`` points of label 1/2, those of them where no other ray went.
 
     Args:
         scans: range scans, world frame.
@@ -155,7 +168,48 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
         ray_id[rows].view_as(depths).copy_(_taken(rays, members)[:, None])
     labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
-    return Samples(points, labels, ray_id, dropped)
+    known = Samples(points, labels, ray_id, dropped)
+    if not config.behind_samples:
+        return known
+    seen = _rows(first)
+    lines = _Lines(
+        starts if len(starts) == 1 else _taken(starts, seen),
+        _taken(ahead, seen),
+        _taken(torch.where(is_hit, free_end, reach), seen),
+    )
+    return _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+
+
+class _Lines(NamedTuple):
+    """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
+
+    starts: Tensor
+    ahead: Tensor
+    reach: Tensor
+
+
+def _with_unknown(
+    known: Samples, ahead: Tensor, lines: _Lines, config: SamplingConfig, rng: torch.Generator
+) -> Samples:
+    """The samples and, after them, unknown points behind the hits, where no ray went.
+
+    Args:
+        known: occupied and free samples, the H hits first.
+        ahead: (H, D) directions of the hits' rays.
+        lines: all rays.
+        config: how many, how deep.
+        rng: random state.
+    """
+    count = config.behind_samples
+    depths = _depths_behind(len(ahead), config, rng)
+    places = (known.points[: len(ahead), None] + depths * ahead[:, None]).flatten(0, 1)
+    rows = _rows(never_crossed(places, *lines, config.cell_edge))
+    return Samples(
+        torch.cat([known.points, _taken(places, rows)]),
+        torch.cat([known.labels, known.labels.new_full((len(rows),), UNKNOWN)]),
+        torch.cat([known.ray_id, known.ray_id[: len(ahead)].repeat_interleave(count)[rows]]),
+        known.dropped,
+    )
 
 
 def _stratified_depths(
@@ -181,6 +235,15 @@ def _near_depths(
     return members, end - depths * end.clamp(max=config.near_reach - config.near_margin)
 
 
+def _depths_behind(count: int, config: SamplingConfig, rng: torch.Generator) -> Tensor:
+    """(count, behind_samples, 1) depths behind hits [m], log-uniform from near_margin to near_reach."""
+    shape = (count, config.behind_samples, 1)
+    share = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)
+    share += torch.arange(config.behind_samples, device=rng.device)[:, None]
+    low = max(config.near_margin, 1e-2 * config.near_reach)
+    return low * (config.near_reach / low) ** (share / config.behind_samples)
+
+
 def _rows(mask: Tensor) -> Tensor:
     """``mask.nonzero().squeeze(1)``, several times as fast where all are meant."""
     if bool(mask.all()):
@@ -191,6 +254,44 @@ def _rows(mask: Tensor) -> Tensor:
 def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
     """``tensor[rows]`` of rows that ascend: the tensor itself, not copied, where they are all."""
     return tensor if len(rows) == len(tensor) else tensor.index_select(0, rows)
+
+
+def table_entry(cells: Tensor) -> Tensor:
+    """(..., D) positions in units of a cell -> (...) entry of the table that its cell has, int64."""
+    whole = cells.floor().long()
+    entry = whole[..., 0] * PRIMES[0]
+    for axis in range(1, cells.shape[-1]):
+        entry = entry ^ (whole[..., axis] * PRIMES[axis % len(PRIMES)])
+    return entry & ((1 << TABLE_BITS) - 1)
+
+
+def never_crossed(
+    points: Tensor, starts: Tensor, ahead: Tensor, reach: Tensor, edge: float
+) -> Tensor:
+    """(N, D) positions -> (N,) bool: no ray went through the cell.
+
+    Cells that a ray cuts by less than a corner may be missed, and a place that shares its entry of
+    the table with a crossed cell is held to be crossed: that is rare, and costs a sample.
+
+    Args:
+        points: (N, D) positions [m].
+        starts: (R, D), or (1, D) where all are one, origins of the rays [m].
+        ahead: (R, D) their directions, of length 1.
+        reach: (R,) how far each was seen to go [m].
+        edge: of the cells [m].
+    """
+    crossed = torch.zeros(1 << TABLE_BITS, dtype=torch.bool, device=points.device)
+    corner = starts.mean(dim=0)  # float32 serves near the origin
+    order = reach.argsort()
+    ends = reach[order]
+    ways = ahead[order].float()
+    begins = (((starts if len(starts) == 1 else starts[order]) - corner) / edge).float()
+    steps = int(ends[-1] / edge) + 1 if len(ends) else 0
+    first = torch.searchsorted(ends, torch.arange(steps, device=ends.device) * edge)
+    for step, begin in enumerate(first.tolist()):
+        start = begins if len(begins) == 1 else begins[begin:]
+        crossed[table_entry(torch.add(start, ways[begin:], alpha=step + 0.5))] = True
+    return ~crossed[table_entry(((points - corner) / edge).float())]
 
 
 def seeded_generator(

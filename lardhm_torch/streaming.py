@@ -13,7 +13,7 @@ from tqdm import tqdm
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io import map_files
 from lardhm_torch.io.atomic_files import remove_partials
-from lardhm_torch.learning.clustering import scan_clusters, split_classes
+from lardhm_torch.learning.clustering import scan_clusters, split_labels
 from lardhm_torch.learning.update import UpdateConfig
 from lardhm_torch.sampling import (
     NoUsableRayError,
@@ -173,7 +173,10 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         rows = torch.randperm(len(scan), generator=rng, device=rng.device)[: config.max_rays]
         scan = scan.select(rows.sort().values)
     try:
-        samples = sample_rays(scan, config.sampling, seed=seed)
+        sampling = config.sampling
+        if len(model):  # `update` learns nothing from unknown points
+            sampling = replace(sampling, behind_samples=0)
+        samples = sample_rays(scan, sampling, seed=seed)
     except NoUsableRayError as error:
         warnings.warn(f"scan {number} was passed over: no usable ray; {error}", stacklevel=3)
         return
@@ -186,6 +189,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
 def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
     if config.max_clusters is None:
         return config.num_clusters
-    classes = split_classes(samples.points, samples.labels > 0.5)
-    chosen = config.num_clusters or sum(scan_clusters(classes))
-    return min(chosen, config.max_clusters)
+    *classes, unknown = split_labels(samples.points, samples.labels)
+    shares = 2 if len(unknown) else 1  # free space beside the unknown takes as many again
+    chosen = config.num_clusters or shares * sum(scan_clusters(classes))
+    return config.num_clusters if chosen <= config.max_clusters else config.max_clusters

@@ -52,7 +52,17 @@ def true_terms(
     scale_tril = kernel_factors(raw, kernel(1))
     offsets = (points[:, None] - centers[indices])[..., None]
     whitened = torch.linalg.solve_triangular(scale_tril[indices], offsets, upper=False)
-    return weights[indices] * torch.exp(-0.5 * whitened.square().sum(dim=(2, 3)))
+    values = torch.exp(-0.5 * whitened.square().sum(dim=(2, 3)))
+    return weights[indices] * values * true_fade(points, centers, indices)
+
+
+def true_fade(points: Tensor, centers: Tensor, indices: Tensor) -> Tensor:
+    """(N, k) what is left of each kernel: 3 u^2 - 2 u^3, u = 2 (1 - t), t of the k-th's distance^2."""
+    distances = (points[:, None] - centers[indices]).square().sum(dim=2)
+    if not 1 < indices.shape[1] < len(centers):
+        return torch.ones_like(distances)
+    u = (2 * (1 - distances / distances.max(dim=1, keepdim=True).values)).clamp(0, 1)
+    return 3 * u**2 - 2 * u**3
 
 
 def assert_neighbors_exact(points: Tensor, centers: Tensor, k: int, found: Tensor) -> None:

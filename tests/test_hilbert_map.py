@@ -191,7 +191,7 @@ def test_a_missing_tensor_and_a_newer_format_are_named():
         LardHilbertMap().load_state_dict(state)
     state = wall_map().state_dict()
     state["_extra_state"]["format_version"] = 99
-    with pytest.raises(ValueError, match="format_version must be 1; got 99"):
+    with pytest.raises(ValueError, match="format_version must be 2; got 99"):
         LardHilbertMap().load_state_dict(state)
     with pytest.raises(ValueError, match="_extra_state must hold"):
         LardHilbertMap().load_state_dict({})
@@ -204,7 +204,7 @@ BAD_SAMPLES = {
     "flat points": (GOOD[0], LABELS[:3], r"points must be \(N, 3\); got \(3,\)"),
     "too few labels": (GOOD, LABELS[:-1], r"labels must be \(40,\).*got \(39,\)"),
     "labels of -1": (GOOD, 2 * LABELS - 1, r"0 or 1; got -1.*labels = \(labels \+ 1\) / 2"),
-    "labels of 0.5": (GOOD, LABELS * 0.5, "labels must be 0 or 1; got 0.5"),
+    "labels of 0.25": (GOOD, LABELS * 0.25, "labels must be 0 or 1; got 0.25"),
     "NaN labels": (GOOD, LABELS * float("nan"), "labels must be 0 or 1; got nan"),
     "NaN": (GOOD * float("nan"), LABELS, r"finite; got 40 rows.*row 0.*isfinite\(\)"),
     "infinity": (GOOD / 0, LABELS, "finite; got 40 rows"),

@@ -73,11 +73,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     if arguments.tune or arguments.tune_state:
         _tune(model, scans, samples, state, arguments)
     model.save(arguments.output)
-    hits = int(samples.labels.sum())
-    print(
-        f"{hits} hits and {len(samples) - hits} free points -> {len(model)} clusters "
-        f"-> {arguments.output}"
-    )
+    hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
+    print(f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}")
 
 
 def _new_map(dim: int, arguments: argparse.Namespace) -> LardHilbertMap:

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from lardhm_torch.io.atomic_files import replaced_file
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
 SAFETENSORS = ".safetensors"
 MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it
@@ -101,10 +101,12 @@ def check_settings(extra: Any) -> dict[str, Any]:
     settings = dict(extra)
     version = settings.pop("format_version")
     if version != FORMAT_VERSION:
-        raise ValueError(
-            f"format_version must be {FORMAT_VERSION}; got {version}. "
+        cure = (
             "A newer map needs a newer lardhm_torch"
+            if version > FORMAT_VERSION
+            else "Fit the map again: the features of older maps do not fade out"
         )
+        raise ValueError(f"format_version must be {FORMAT_VERSION}; got {version}. {cure}")
     return settings
 
 

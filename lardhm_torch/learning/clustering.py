@@ -24,6 +24,8 @@ CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] of the cells that tell the two apar
 CELLS_PER_SCAN_CLUSTER = 1  # the same where more scans will follow: a single one shows less
 MAX_CHOSEN = 5000  # a class
 START_POINTS = 50  # a center, drawn at random, among which the start is chosen
+ITERATIONS = 20  # of k-means: t of Algorithm 1
+VOLUME_ITERATIONS = 5  # the same where clusters fill a volume beside an unknown one: they are many
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
@@ -59,18 +61,21 @@ class Clusters(Columns):
         return self.scatters / (self.counts - 1).clamp(min=1)[:, None, None]
 
 
-def cluster_points(points: Tensor, num_clusters: int, rng: torch.Generator) -> Clusters:
+def cluster_points(
+    points: Tensor, num_clusters: int, rng: torch.Generator, iterations: int = ITERATIONS
+) -> Clusters:
     """At most ``num_clusters`` clusters of the points, none of fewer than five unless there are fewer.
 
     Args:
         points: (N, D) positions of one class [m], in the order of `morton_order`.
         num_clusters: how many to look for; more than N / 5 means N / 5.
         rng: random state of the start and of the batches.
+        iterations: of k-means.
 
     Source: Guizilini & Ramos 2016, Algorithm 1, eq. (6), (7) and Section IV-B.
     """
     num_clusters = max(1, min(num_clusters, len(points) // MIN_COUNT))
-    centers = mini_batch_kmeans(points, num_clusters, rng)
+    centers = mini_batch_kmeans(points, num_clusters, rng, iterations=iterations)
     _, counts, sums, scatters = native.assign(points, centers)
     clusters = merge_small(clusters_about(centers, counts, sums, scatters))
     # Neighbors in space are neighbors in memory: queries of large maps are faster.
@@ -92,29 +97,41 @@ def cluster_classes(
     Returns:
         (M clusters, the occupied ones first; (M,) bool, which are occupied).
     """
-    classes = split_classes(points, labels > 0.5)
+    classes = split_labels(points, labels)
     if num_clusters is None:
-        totals = [choose_num_clusters(classes[0] if len(classes[0]) else classes[1])] * 2
+        chosen = choose_num_clusters(next(members for members in classes if len(members)))
+        totals = [chosen * share for share in class_shares(len(classes[2]))]
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
     return cluster_each(classes, totals, rng)
 
 
+def class_shares(num_unknown: int) -> tuple[int, int, int]:
+    """Clusters of the occupied, the free and the unknown points, in proportion.
+
+    Free space that must end where the unknown begins takes twice as many clusters.
+    """
+    return (1, 2, 1) if num_unknown else (1, 1, 0)
+
+
 def cluster_each(
     classes: list[Tensor], totals: Sequence[int], rng: torch.Generator
 ) -> tuple[Clusters, Tensor]:
-    """(M clusters, (M,) bool which are occupied) of the occupied and of the free points, in order.
+    """(M clusters, (M,) bool which are occupied) of the points of each class, in order.
 
     Args:
-        classes: (N, D) occupied and (F, D) free positions [m], in the order of `morton_order`.
+        classes: (N, D) occupied, (F, D) free and, if given, (U, D) unknown positions [m], in the
+            order of `morton_order`.
         totals: how many clusters of each to look for.
         rng: random state.
     """
-    parts = [
-        cluster_points(members, total, rng)
-        for members, total in zip(classes, totals, strict=True)
-        if len(members)
-    ]
+    with_unknown = len(classes) > 2 and len(classes[2]) > 0
+    rest = VOLUME_ITERATIONS if with_unknown else ITERATIONS
+    parts = []
+    for number, (members, total) in enumerate(zip(classes, totals, strict=True)):
+        if len(members) and total:
+            found = cluster_points(members, total, rng, rest if number else ITERATIONS)
+            parts.append(of_unknown(found) if number == 2 else found)
     clusters = concatenate_clusters(parts)
     is_occupied = torch.zeros_like(clusters.counts, dtype=torch.bool)
     is_occupied[: len(parts[0]) if len(classes[0]) else 0] = True
@@ -129,6 +146,19 @@ def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
     return [points_where(points, is_occupied), points_where(points, ~is_occupied)]
 
 
+def split_labels(points: Tensor, labels: Tensor) -> list[Tensor]:
+    """Occupied, free and unknown points, by labels of 1, 0 and 1/2."""
+    occupied, rest = split_classes(points, labels > 0.5)
+    if bool((labels != 0.5).all()):
+        return [occupied, rest, rest[:0]]
+    return [occupied, points_where(points, labels < 0.5), points_where(points, labels == 0.5)]
+
+
+def of_unknown(clusters: Clusters) -> Clusters:
+    """Clusters of unknown points: as wide, but they count nothing, and all that is seen replaces them."""
+    return Clusters(torch.zeros_like(clusters.counts), clusters.means, clusters.covariances)
+
+
 def points_where(points: Tensor, mask: Tensor) -> Tensor:
     """``points[mask]``, twice as fast."""
     return points.index_select(0, mask.nonzero().squeeze(1))
@@ -140,14 +170,19 @@ def concatenate_clusters(parts: list[Clusters]) -> Clusters:
 
 
 def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
-    """How many clusters each of the two classes gets.
+    """How many clusters each class gets: occupied, free and, where there are any, unknown points.
 
-    Half each, the odd one to the occupied class; a class that cannot fill its half (five points a
-    cluster) leaves the rest to the other.
+    By `class_shares`, what does not go round to the occupied class; a class that cannot fill its
+    share (five points a cluster) leaves the rest to the others.
     """
     room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
-    occupied = min(room[0], max(-(-num_clusters // 2), num_clusters - room[1]))
-    return [occupied, min(room[1], num_clusters - occupied)]
+    num_unknown = room[2] if len(room) > 2 else 0
+    shares = class_shares(num_unknown)
+    unknown = min(num_unknown, num_clusters * shares[2] // sum(shares))
+    known = num_clusters - unknown
+    fair = -(-known * shares[0] // (shares[0] + shares[1]))
+    occupied = min(room[0], max(fair, known - room[1]))
+    return [occupied, min(room[1], known - occupied), unknown][: len(room)]
 
 
 def scan_clusters(classes: list[Tensor]) -> list[int]:
@@ -202,7 +237,7 @@ def mini_batch_kmeans(
     num_clusters: int,
     rng: torch.Generator,
     *,
-    iterations: int = 20,
+    iterations: int = ITERATIONS,
     batch_size: int | None = None,
     restart_every: int = 5,
 ) -> Tensor:

@@ -104,7 +104,9 @@ def fine_tune(
 def _check(
     model: MapParameters, points: Tensor, labels: Tensor, ray_id: Tensor | None
 ) -> LabelledPoints:
-    points, labels = check_samples(points, labels, model.dim, model.origin.device)
+    points, labels = check_samples(
+        points, labels, model.dim, model.origin.device, keep_unknown=True
+    )
     if ray_id is not None:
         ray_id = torch.as_tensor(ray_id, device=points.device)
         if ray_id.shape != labels.shape:
@@ -246,7 +248,7 @@ class TuningRun:
             weights, centers, raw = self.current()
             labels = samples.labels[rows].to(weights.dtype)
             answer = self.log_odds(samples.positions[rows], weights, centers, raw)
-            loss = logistic_loss(answer, labels, factors[labels.long()]) / len(rows)
+            loss = logistic_loss(answer, labels, factors[(2 * labels).long()]) / len(rows)
             moved = sum(offset.square().sum() for offset in self.offsets[1:])
             penalty = config.l2 * weights.square().sum() + config.stiffness * moved
             self.optimizer.zero_grad()

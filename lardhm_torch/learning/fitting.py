@@ -14,6 +14,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.clustering import cluster_classes
 from lardhm_torch.learning.map_state import MapState, new_rows
+from lardhm_torch.learning.unseen import settle_unknown
 
 CHUNK_ROWS = 1 << 21  # points whose features are computed at a time
 CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
@@ -41,6 +42,7 @@ class FitConfig:
     # The occupied class's share where classes are balanced. More than half, because hits are few
     # and free points many: what is learned of hits carries over to unseen rays less surely.
     occupied_share: float = 0.6
+    unknown_share: float = 0.25  # of the unknown points' loss, beside the loss of the two classes
 
     def rows_a_batch(self, num_points: int) -> int:
         """Points a step: about ``batch_size``, such that all batches of a pass are equally large."""
@@ -56,6 +58,8 @@ class FitConfig:
             raise ValueError(f"learning_rate must be > 0; got {self.learning_rate}")
         if not 0 < self.occupied_share < 1:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
+        if not self.unknown_share >= 0:
+            raise ValueError(f"unknown_share must be 0 or more; got {self.unknown_share}")
         if self.l1 < 0 or self.l2 < 0:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
@@ -76,7 +80,7 @@ def fit_clusters(
 
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
-        labels: (N,) 1 occupied, 0 free, of the points' dtype.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown, of the points' dtype.
         num_clusters: total over both classes; None: chosen from the data.
         task: kernel, settings, random state.
 
@@ -84,8 +88,8 @@ def fit_clusters(
     """
     clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
-    columns = (points, labels)
-    points, labels = deal_samples(columns, task.config.rows_a_batch(len(points)), task.rng)
+    columns = settle_unknown(points, labels, state, task.kernel, task.rng)
+    points, labels = deal_samples(columns, task.config.rows_a_batch(len(columns[0])), task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:
@@ -138,15 +142,26 @@ def class_factors(free: Tensor, occupied: Tensor, occupied_share: float = 0.5) -
     return torch.where((occupied > 0) & (free > 0), balanced, torch.ones_like(balanced))
 
 
-def label_factors(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
-    """(N,) labels -> (2,) `class_factors`, float64."""
-    occupied = labels.sum().double()
-    return class_factors(len(labels) - occupied, occupied, occupied_share)
+def label_factors(
+    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
+) -> Tensor:
+    """(N,) labels -> (3,) loss factors of a free, an unknown and an occupied point, float64.
+
+    Those of `class_factors`; the unknown points together count ``unknown_share`` of the others.
+    """
+    occupied = (labels > 0.5).sum().double()
+    unknown = (labels == 0.5).sum().double()
+    known = len(labels) - unknown
+    free, hit = class_factors(known - occupied, occupied, occupied_share).unbind()
+    return torch.stack([free, unknown_share * known / unknown.clamp(min=1), hit])
 
 
-def balance_classes(labels: Tensor, occupied_share: float = 0.5) -> Tensor:
-    """(N,) labels -> (N,) loss factors, see `class_factors`."""
-    return label_factors(labels, occupied_share).to(labels)[labels.long()]
+def balance_classes(
+    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
+) -> Tensor:
+    """(N,) labels -> (N,) loss factors, see `label_factors`."""
+    factors = label_factors(labels, occupied_share, unknown_share).to(labels)
+    return factors[(2 * labels).long()]
 
 
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
@@ -176,7 +191,7 @@ def fit_weights(
 
     Args:
         features_of: slice of B rows -> indices (B, K) and kernel values (B, K) of those points.
-        labels: (N,) 1 occupied, 0 free, in the order of `deal_samples`.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown, in the order of `deal_samples`.
         weights: (M,) start, left as it is.
         config: passes, rates and regularizer.
         progress: show a bar on a terminal.
@@ -188,8 +203,8 @@ def fit_weights(
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
     if factors is None:
-        share = config.occupied_share
-        factors = balance_classes(labels, share) if config.balance else torch.ones_like(labels)
+        shares = (config.occupied_share, config.unknown_share)
+        factors = balance_classes(labels, *shares) if config.balance else torch.ones_like(labels)
     batch_size = config.rows_a_batch(len(labels))
     plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))

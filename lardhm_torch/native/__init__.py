@@ -304,6 +304,7 @@ def _differentiable_gradients(
     indices = nearest_centers(points, centers, kernel.num_neighbors)
     factors = features.kernel_factors(raw_scale_tril, kernel)
     values = features.lard_kernel(points, centers, factors, indices)
+    values = values * features.neighbor_fade(points, centers, indices)
     answer = (values * weights[indices]).sum(dim=1)
     answer = torch.sigmoid(answer) if probability else answer
     asked = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]

@@ -91,13 +91,14 @@ struct Engine {
   const T* positions;
   int k;
   KthFn<T, D> kth;
+  bool fades;  // as `features.fades`
   T origin[D];
   float reach, smallest_radius;  // [m] edge of the centers' box; where guesses begin
 
   Engine(const T* points_, Parameters<T, D>& parameters_, int64_t k_)
       : index(parameters_.index), points(points_), parameters(parameters_),
         positions(parameters_.positions.data), k(int(k_)),
-        kth(kth_distance_for<T, D>(int(k_))), reach(0) {
+        kth(kth_distance_for<T, D>(int(k_))), fades(k_ > 1 && k_ < index.header.count), reach(0) {
     for (int d = 0; d < D; ++d) {
       origin[d] = T(index.header.low[d]);
       reach = std::max(reach, float(index.header.high[d] - index.header.low[d]));
@@ -302,6 +303,7 @@ struct Engine {
       if (farthest <= radius) {
         s.radius = farthest * 1.15f;
         packet.farthest = (V)limit;
+        packet.fading = fades ? T(1) / (packet.farthest + std::numeric_limits<T>::min()) : V{};
         return slack ? select_farther(packet, region, s) : select(packet, limit, n, s);
       }
       radius = farthest;

@@ -18,17 +18,19 @@ enum Wanted { kPoints = 1, kCenters = 2, kScaleTril = 4, kWeights = 8 };
 template <class T, int D>
 struct BackwardVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
+  using I = typename Simd<T>::I;
   using L = Layout<D>;
   const T *positions, *shapes, *grad;
-  bool probability;
+  bool probability, fades;
   int64_t wanted;
   T *grad_points, *sums;
   std::vector<char> bytes;
 
   BackwardVisitor(const Parameters<T, D>& parameters, const T* grad_, bool probability_,
-                  int64_t wanted_, T* grad_points_, T* sums_)
+                  bool fades_, int64_t wanted_, T* grad_points_, T* sums_)
       : positions(parameters.positions.data), shapes(parameters.shapes.data), grad(grad_),
-        probability(probability_), wanted(wanted_), grad_points(grad_points_), sums(sums_) {}
+        probability(probability_), fades(fades_), wanted(wanted_), grad_points(grad_points_),
+        sums(sums_) {}
 
   void invalid(int64_t row) override {
     if (!(wanted & kPoints)) return;
@@ -36,25 +38,36 @@ struct BackwardVisitor final : Visitor<T, D> {
   }
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
-    bytes.resize((selected.size + 1) * (D + 1) * sizeof(V) + 64);
+    bytes.resize((selected.size + 1) * kTerms * sizeof(V) + 64);
     V* terms = reinterpret_cast<V*>((reinterpret_cast<uintptr_t>(bytes.data()) + 63) / 64 * 64);
     const V g = incoming(packet, selected, terms);
-    V towards[D] = {};
+    V towards[D] = {}, reach = {};
     for (int64_t j = 0; j < selected.size; ++j)
-      cluster(selected.rank[j], g, terms + j * (D + 1), towards);
+      cluster(packet, selected.rank[j], g, terms + j * kTerms, towards, reach);
+    if (fades) farthest(packet, selected, terms, reach, towards);
     if (!(wanted & kPoints)) return;
     for (int lane = 0; lane < packet.lanes; ++lane)
       for (int d = 0; d < D; ++d) grad_points[packet.row(lane) * D + d] = -towards[d][lane];
   }
 
-  // Gradient that reaches the log-odds; the terms of a cluster are z and the masked kernel value.
+  // Of each cluster: z, the faded and masked kernel value, the share t of the k-th squared distance,
+  // the masked kernel value times the slope of the fade.
+  static constexpr int kTerms = D + 3;
+
+  // Gradient that reaches the log-odds; fills in the terms of the clusters.
   V incoming(const Packet<T, D>& packet, const Selection& selected, V* terms) const {
     V sum = {}, g = {};
     for (int64_t j = 0; j < selected.size; ++j) {
+      const T* center = positions + int64_t(selected.rank[j]) * L::position;
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
-      V* z = terms + j * (D + 1);
-      whiten<T, D>(packet, positions + int64_t(selected.rank[j]) * L::position, shape, z);
-      z[D] = mask_of<T>(selected.bits[j]) ? kernel_of<T, D>(z) : V{};
+      V* z = terms + j * kTerms;
+      V squared = {};
+      for (int d = 0; d < D; ++d) squared += (packet.x[d] - center[d]) * (packet.x[d] - center[d]);
+      whiten<T, D>(packet, center, shape, z);
+      const V kernel = mask_of<T>(selected.bits[j]) ? kernel_of<T, D>(z) : V{};
+      z[D + 1] = squared * packet.fading;
+      z[D] = kernel * fade_of<T>(z[D + 1]);
+      z[D + 2] = kernel * fade_slope<T>(z[D + 1]);
       sum += z[D] * shape[L::weight];
     }
     for (int lane = 0; lane < packet.lanes; ++lane) g[lane] = grad[packet.row(lane)];
@@ -63,8 +76,9 @@ struct BackwardVisitor final : Visitor<T, D> {
     return g * p * sigmoid<T>(-sum);
   }
 
-  // Adds one cluster's share; y = inv(L)^T z, d log_odds / dc = w phi y, dL = w phi y z^T.
-  void cluster(int32_t rank, V g, const V* z, V* towards) {
+  // Adds one cluster's share; y = inv(L)^T z, d log_odds / dc = w phi y, dL = w phi y z^T. The fade
+  // adds 2 w kernel slope (c - x) / d_k^2 to the center, and its part by d_k^2 to `reach`.
+  void cluster(const Packet<T, D>& packet, int32_t rank, V g, const V* z, V* towards, V& reach) {
     const T* shape = shapes + int64_t(rank) * L::shape;
     T* sum = sums + int64_t(rank) * L::gradient;
     const V by_weight = g * z[D];
@@ -78,13 +92,42 @@ struct BackwardVisitor final : Visitor<T, D> {
     y[0] = share * z[0] - y[1] * below[0];
     if constexpr (D == 3) y[0] -= y[2] * below[1];
     y[0] *= shape[0];
-    for (int d = 0; d < D; ++d) towards[d] += y[d];
-    if (wanted & kCenters)
-      for (int d = 0; d < D; ++d) sum[1 + d] += sum_lanes<T>(y[d]);
+    const V by_fade = g * shape[L::weight] * z[D + 2] * packet.fading;
+    reach -= by_fade * z[D + 1];
+    const T* center = positions + int64_t(rank) * L::position;
+    for (int d = 0; d < D; ++d) {
+      const V moved = y[d] + T(2) * by_fade * (center[d] - packet.x[d]);
+      towards[d] += moved;
+      if (wanted & kCenters) sum[1 + d] += sum_lanes<T>(moved);
+    }
     if (!(wanted & kScaleTril)) return;
     T* factor = sum + 1 + D;
     for (int i = 0; i < D; ++i)
       for (int j = 0; j <= i; ++j) *factor++ += sum_lanes<T>(y[i] * z[j]);
+  }
+
+  // The gradient by d_k^2, shared by the centers at that distance, as `amax` shares it.
+  void farthest(const Packet<T, D>& packet, const Selection& selected, const V* terms, V reach,
+                V* towards) {
+    if (!(wanted & (kPoints | kCenters))) return;
+    V most = {}, tied = {};
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const V t = mask_of<T>(selected.bits[j]) ? terms[j * kTerms + D + 1] : V{};
+      most = t > most ? t : most;
+    }
+    for (int64_t j = 0; j < selected.size; ++j)
+      tied += mask_of<T>(selected.bits[j]) & (terms[j * kTerms + D + 1] >= most) ? T(1) - V{} : V{};
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const I at_it = mask_of<T>(selected.bits[j]) & (terms[j * kTerms + D + 1] >= most);
+      if (!bits_of<T>(at_it)) continue;
+      const T* center = positions + int64_t(selected.rank[j]) * L::position;
+      T* sum = sums + int64_t(selected.rank[j]) * L::gradient;
+      for (int d = 0; d < D; ++d) {
+        const V moved = at_it ? T(2) * reach / tied * (center[d] - packet.x[d]) : V{};
+        towards[d] += moved;
+        if (wanted & kCenters) sum[1 + d] += sum_lanes<T>(moved);
+      }
+    }
   }
 };
 
@@ -156,7 +199,7 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
       std::vector<T> sums((wanted & ~kPoints) ? size * parts : 0);
       std::vector<BackwardVisitor<T, dim()>> visitors;
       for (int64_t part = 0; part < parts; ++part)
-        visitors.emplace_back(parameters, in<T>(grad), probability, wanted,
+        visitors.emplace_back(parameters, in<T>(grad), probability, k > 1 && k < count, wanted,
                               (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr,
                               sums.data() + part * size);
       visit_parts<T, dim()>(in<T>(points), n, parameters, k, each_of<T, dim()>(visitors));

@@ -5,6 +5,7 @@
 // within d + 2h of the middle, and among those of all of its points if it is within d - 2h. So the
 // log-odds are at most the sum over the former with positive weights, each at its largest, plus that
 // over the latter with negative weights, each at its smallest: on a line, both are known exactly.
+// How far a cluster can have faded there follows from the same distances.
 
 #pragma once
 
@@ -65,10 +66,13 @@ struct IntervalVisitor final : Visitor<T, D> {
       const T* center = positions + int64_t(selected.rank[j]) * L::position;
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
       const I shown = mask_of<T>(selected.bits[j]);
-      if (shape[L::weight] > 0)
-        add_largest(packet, way, half, center, shape, shown, sum);
+      const V squared = squared_distance(packet, center);
+      const bool adds = shape[L::weight] > 0;
+      const V weight = shape[L::weight] * fade_within(packet, squared, nearby, adds ? half : -half);
+      if (adds)
+        add_largest(packet, way, half, center, shape, weight, shown, sum);
       else
-        add_smallest(packet, way, half, center, shape, shown & within(packet, center, inner), sum);
+        add_smallest(packet, way, half, center, shape, weight, shown & (squared < inner), sum);
     }
     store_rows<T, D>(nearby, packet, intervals.nearby.data());
     for (int lane = 0; lane < packet.lanes; ++lane)
@@ -86,13 +90,26 @@ struct IntervalVisitor final : Visitor<T, D> {
     }
   }
 
-  static I within(const Packet<T, D>& packet, const T* center, V squared) {
+  static V squared_distance(const Packet<T, D>& packet, const T* center) {
     V distance = {};
     for (int d = 0; d < D; ++d) {
       const V offset = packet.x[d] - center[d];
       distance += offset * offset;
     }
-    return distance < squared;
+    return distance;
+  }
+
+  // The largest fade within `half` of the middle or, for a negative one, the smallest: nowhere is a
+  // center nearer, or the k-th farther, by more than that.
+  static V fade_within(const Packet<T, D>& packet, V squared, V nearby, V half) {
+    V share = {};
+    for (int lane = 0; lane < packet.lanes; ++lane) {
+      if (packet.fading[lane] == 0) continue;
+      const T distance = std::max(std::sqrt(squared[lane]) - half[lane], T(0));
+      const T farthest = std::max(nearby[lane] + half[lane], std::numeric_limits<T>::min());
+      share[lane] = distance / farthest * (half[lane] > 0 ? T(1 - kRounding) : T(1 + kRounding));
+    }
+    return fade_of<T>(share * share);
   }
 
   // z z, z u and u u, with z the whitened offset of the middle and u the whitened direction.
@@ -106,7 +123,7 @@ struct IntervalVisitor final : Visitor<T, D> {
   }
 
   // Adds weight exp(-squared / 2) in the lanes that are shown; whether any is worth it.
-  static void add(V squared, T weight, I shown, V& sum) {
+  static void add(V squared, V weight, I shown, V& sum) {
     const I seen = shown & (squared < T(kSilent));
     if (!bits_of<T>(seen)) return;
     sum += seen ? exp_of<T>(T(-0.5) * squared) * weight : V{};
@@ -114,7 +131,7 @@ struct IntervalVisitor final : Visitor<T, D> {
 
   // A cluster of positive weight, where each quarter comes closest to it.
   static void add_largest(const Packet<T, D>& packet, const V* way, V half, const T* center,
-                          const T* shape, I shown, V* sum) {
+                          const T* shape, V weight, I shown, V* sum) {
     V zz, zu, uu;
     products(packet, way, center, shape, zz, zu, uu);
     const V closest = -zu / uu;
@@ -124,20 +141,20 @@ struct IntervalVisitor final : Visitor<T, D> {
       V at = closest < high ? closest : high;
       at = at > low ? at : low;
       const V squared = zz + at * (2 * zu + at * uu);
-      add(squared > 0 ? squared : V{}, shape[L::weight], shown, sum[i]);
+      add(squared > 0 ? squared : V{}, weight, shown, sum[i]);
     }
   }
 
   // A cluster of negative weight, at the farther end of each quarter.
   static void add_smallest(const Packet<T, D>& packet, const V* way, V half, const T* center,
-                           const T* shape, I shown, V* sum) {
+                           const T* shape, V weight, I shown, V* sum) {
     if (!bits_of<T>(shown)) return;
     V zz, zu, uu;
     products(packet, way, center, shape, zz, zu, uu);
     for (int i = 0; i < kQuarters; ++i) {
       const V low = half * T(i * 2.0 / kQuarters - 1), high = low + half * T(2.0 / kQuarters);
       const V first = zz + low * (2 * zu + low * uu), end = zz + high * (2 * zu + high * uu);
-      add(first > end ? first : end, shape[L::weight], shown, sum[i]);
+      add(first > end ? first : end, weight, shown, sum[i]);
     }
   }
 };

@@ -8,6 +8,8 @@
 
 namespace lardhm {
 
+constexpr double kFading = 0.5;  // as features.FADING
+
 // Whitened offset inv(L) offset.
 template <class T, int D>
 inline void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
@@ -16,6 +18,16 @@ inline void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
   z[0] = offset[0] * shape[0];
   z[1] = (offset[1] - z[0] * below[0]) * shape[1];
   if constexpr (D == 3) z[2] = (offset[2] - z[0] * below[1] - z[1] * below[2]) * shape[2];
+}
+
+// How much of a neighbor's kernel is left at the share t of the k-th center's squared distance, as
+// `features.neighbor_fade`.
+template <class T>
+inline typename Simd<T>::V fade_of(typename Simd<T>::V t) {
+  using V = typename Simd<T>::V;
+  const V left = (T(1) - t) * T(1 / kFading);
+  const V u = left > 0 ? (left < T(1) ? left : V{} + T(1)) : V{};
+  return u * u * (T(3) - T(2) * u);
 }
 
 // Whitened offset z = inv(L) (x - c) of a packet from one cluster.
@@ -32,6 +44,27 @@ inline typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
   typename Simd<T>::V squared = z[0] * z[0];
   for (int d = 1; d < D; ++d) squared += z[d] * z[d];
   return exp_of<T>(squared * T(-0.5));
+}
+
+// Its derivative by t.
+template <class T>
+inline typename Simd<T>::V fade_slope(typename Simd<T>::V t) {
+  using V = typename Simd<T>::V;
+  const V u = (T(1) - t) * T(1 / kFading);
+  return u > 0 ? (u < T(1) ? u * (u - T(1)) * T(6 / kFading) : V{}) : V{};
+}
+
+// A packet's kernel values of one cluster, faded.
+template <class T, int D>
+inline typename Simd<T>::V feature_of(const Packet<T, D>& packet, const T* center,
+                                      const T* shape) {
+  using V = typename Simd<T>::V;
+  V offset[D], z[D];
+  for (int d = 0; d < D; ++d) offset[d] = packet.x[d] - center[d];
+  whiten_offset<T, D>(offset, shape, z);
+  V squared = offset[0] * offset[0];
+  for (int d = 1; d < D; ++d) squared += offset[d] * offset[d];
+  return kernel_of<T, D>(z) * fade_of<T>(squared * packet.fading);
 }
 
 template <class T, int D>

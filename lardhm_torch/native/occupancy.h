@@ -28,9 +28,8 @@ struct OccupancyVisitor final : Visitor<T, D> {
     V sum = {};
     for (int64_t j = 0; j < selected.size; ++j) {
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
-      V z[D];
-      whiten<T, D>(packet, positions + int64_t(selected.rank[j]) * L::position, shape, z);
-      const V term = kernel_of<T, D>(z) * shape[L::weight];
+      const T* center = positions + int64_t(selected.rank[j]) * L::position;
+      const V term = feature_of<T, D>(packet, center, shape) * shape[L::weight];
       sum = mask_of<T>(selected.bits[j]) ? sum + term : sum;
     }
     store_rows<T, D>(probability ? sigmoid<T>(sum) : sum, packet, out);

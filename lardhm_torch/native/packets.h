@@ -13,6 +13,7 @@ template <class T, int D>
 struct Packet {
   typename Simd<T>::V x[D];
   typename Simd<T>::V farthest;  // squared distance of the k-th center [m^2], once it is known
+  typename Simd<T>::V fading;    // its inverse [m^-2]; 0 where neighbors do not fade
   int64_t begin;
   const int32_t* order;
   int lanes;

@@ -70,10 +70,8 @@ struct NeighborVisitor final : Visitor<T, D> {
       const int64_t at = uint32_t(centers[j]), rank = selected.rank[at];
       bits[j] = selected.bits[at];
       if (!values) continue;
-      V z[D];
-      whiten<T, D>(packet, positions + rank * Layout<D>::position,
-                   shapes + rank * Layout<D>::shape, z);
-      const V value = kernel_of<T, D>(z);
+      const V value = feature_of<T, D>(packet, positions + rank * Layout<D>::position,
+                                       shapes + rank * Layout<D>::shape);
       std::memcpy(kernel[j], &value, sizeof(value));
     }
     for (int lane = 0; lane < packet.lanes; ++lane)

@@ -4,26 +4,25 @@ Obstacles occur along a path like the events of a Poisson process with rate
 lambda(x) = max(log-odds(x), 0) / length [1/m]. The path is free with probability
 exp(-integral of lambda). Free and unknown space have no hazard.
 
-As long as the k nearest clusters are the same, the log-odds along a line are a sum of Gaussians, whose
-integrals are error functions. The region with given k nearest centers is convex: if the neighbors at
-both ends of an interval are equal, they are the same all along it. Lines are bisected until this
-holds.
+The log-odds along a line are smooth, because neighbors fade out before others replace them. Between
+the places where they change sign, which are found by bisection, a Gauss-Legendre quadrature with a
+few nodes per step integrates them.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from typing import NamedTuple
 
 import torch
+from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, num_neighbors, to_tensor
-from lardhm_torch.native import nearest_centers
+from lardhm_torch.maps import OccupancyMap, TensorLike, to_tensor
 
 HAZARD_LENGTH = 0.1  # [m] default path length over which log-odds of 1 are one expected obstacle
 SHORTEST = 1e-6  # [m] intervals are not bisected below this length
+NODES = 5  # of the quadrature, per interval
 SEGMENTS_AT_ONCE = 1 << 16
 
 
@@ -31,15 +30,12 @@ class Intervals(NamedTuple):
     """I intervals of segments.
 
     ``segment`` (I,) index of the segment; ``first`` and ``last`` (I,) ends of the interval as
-    fractions of the segment; the k nearest clusters (I, K) at both ends; and whether the log-odds
-    are positive (I,) at both ends.
+    fractions of the segment; and whether the log-odds are positive (I,) at both ends.
     """
 
     segment: Tensor
     first: Tensor
     last: Tensor
-    neighbors_first: Tensor
-    neighbors_last: Tensor
     positive_first: Tensor
     positive_last: Tensor
 
@@ -115,7 +111,7 @@ def _sphere_points(dim: int, radius: float) -> Tensor:
 def _positive_intervals(
     model: OccupancyMap, starts: Tensor, ends: Tensor, step: float
 ) -> Intervals:
-    """Intervals of (S, D) segments with positive log-odds, each with one set of neighbors."""
+    """Intervals of (S, D) segments with positive log-odds, none longer than a step."""
     paths = ends - starts
     lengths = torch.linalg.vector_norm(paths, dim=1)
     counts = (lengths / step).ceil().long()  # 0 for a segment of length 0
@@ -124,31 +120,23 @@ def _positive_intervals(
     number = number - (counts.cumsum(0) - counts)[segment]
     first, last = (number / counts[segment]).double(), ((number + 1) / counts[segment]).double()
 
-    def at(which: Tensor, fraction: Tensor) -> tuple[Tensor, Tensor]:
-        return _neighbors_and_sign(model, starts[which] + fraction[:, None] * paths[which])
+    def positive(which: Tensor, fraction: Tensor) -> Tensor:
+        return model.log_odds(starts[which] + fraction[:, None] * paths[which]) > 0
 
-    (near, positive), (near_last, positive_last) = at(segment, first), at(segment, last)
-    open_ = Intervals(segment, first, last, near, near_last, positive, positive_last)
-    done = [_select(open_, torch.zeros_like(positive))]
+    signs = positive(segment, first), positive(segment, last)
+    open_ = Intervals(segment, first, last, *signs)
+    done = [_select(open_, torch.zeros_like(signs[0]))]
     while len(open_.segment):
-        uniform = (open_.neighbors_first == open_.neighbors_last).all(dim=1)
-        uniform &= open_.positive_first == open_.positive_last
+        uniform = open_.positive_first == open_.positive_last
         uniform |= (open_.last - open_.first) * lengths[open_.segment] < SHORTEST
         done.append(_select(open_, uniform & open_.positive_last))
         rest = _select(open_, ~uniform)
         middle = (rest.first + rest.last) / 2
-        near, positive = at(rest.segment, middle)
-        left = rest._replace(last=middle, neighbors_last=near, positive_last=positive)
-        right = rest._replace(first=middle, neighbors_first=near, positive_first=positive)
+        sign = positive(rest.segment, middle)
+        left = rest._replace(last=middle, positive_last=sign)
+        right = rest._replace(first=middle, positive_first=sign)
         open_ = Intervals(*(torch.cat(pair) for pair in zip(left, right, strict=True)))
     return Intervals(*(torch.cat(parts) for parts in zip(*done, strict=True)))
-
-
-def _neighbors_and_sign(model: OccupancyMap, points: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, K) nearest clusters of (N, D) points, and (N,) whether the log-odds are positive."""
-    local = (points - model.origin).to(model.centers.dtype)
-    nearest = nearest_centers(local, model.centers.detach(), num_neighbors(model))
-    return nearest, model.log_odds(points) > 0
 
 
 def _select(intervals: Intervals, mask: Tensor) -> Intervals:
@@ -156,30 +144,13 @@ def _select(intervals: Intervals, mask: Tensor) -> Intervals:
 
 
 def _integrate(model: OccupancyMap, starts: Tensor, ends: Tensor, intervals: Intervals) -> Tensor:
-    """(S,) integral of the log-odds over the intervals of each segment [m].
-
-    With z = inv(L) (a - c) and u = inv(L) (b - a), a kernel on the line from a to b is
-    exp(-|z + s u|^2 / 2) for s from 0 to 1. Its integral over s is
-
-        exp(-|z + m u|^2 / 2) sqrt(pi / 2) / |u| (erf(|u| (1 - m) / sqrt 2) + erf(|u| m / sqrt 2))
-
-    with the maximum at m = -z u / |u|^2.
-    """
-    rows, near = intervals.segment, intervals.neighbors_last
+    """(S,) integral of the log-odds over the intervals of each segment [m]."""
+    rows = intervals.segment
     path = ends[rows] - starts[rows]
     start = starts[rows] + intervals.first[:, None] * path
     path = (intervals.last - intervals.first)[:, None] * path
-    factors = model.scale_tril.double()
-    eye = torch.eye(model.dim, dtype=torch.float64, device=factors.device)
-    whiten = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)[near]
-    offsets = start[:, None] - (model.centers.double() + model.origin)[near]  # (I, K, D)
-    z = (whiten @ offsets[..., None]).squeeze(-1)
-    u = (whiten @ path[:, None, :, None]).squeeze(-1)
-    squared = u.square().sum(dim=-1)
-    middle = -(z * u).sum(dim=-1) / squared
-    peak = torch.exp(-0.5 * (z + middle[..., None] * u).square().sum(dim=-1))
-    scale = squared.sqrt() / math.sqrt(2)
-    area = torch.erf(scale * (1 - middle)) + torch.erf(scale * middle)
-    values = model.weights.double()[near] * peak * area * (math.sqrt(math.pi) / 2) / scale
+    nodes, shares = (torch.from_numpy(x).to(starts.device) for x in leggauss(NODES))
+    points = start[:, None] + (0.5 + 0.5 * nodes[:, None]) * path[:, None]  # (I, NODES, D)
+    means = (model.log_odds(points).double() * shares).sum(dim=1) / 2
     lengths = torch.linalg.vector_norm(path, dim=1)
-    return starts.new_zeros(len(starts)).index_add(0, rows, values.sum(dim=1) * lengths)
+    return starts.new_zeros(len(starts)).index_add(0, rows, means * lengths)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -206,7 +206,8 @@ class _Router:
             return
         if not bool(usable_rays(piece, self.sampling)[0].any()):
             return
-        samples = sample_rays(piece, self.sampling, seed=seed)
+        known = replace(self.sampling, behind_samples=0)  # a tile's file has two kinds of points
+        samples = sample_rays(piece, known, seed=seed)
         for index, records in route(samples.points, samples.labels, self.grid):
             self.buffers.setdefault(index, []).append(records)
             self.buffered += records.nbytes

@@ -1,0 +1,105 @@
+"""Unknown space: training points of label 1/2, so that the map says 1/2 where nothing was seen.
+
+Kernels reach across walls and beyond what was seen, and no occupied or free sample contradicts them
+there. Unknown points do: `sampling` places them behind hits, where no ray was, and `draw_tails` in
+the tails of the clusters. They form clusters of their own, whose weights cancel what reaches across,
+so that the clusters of surfaces and of free space keep their capacity.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.features import Kernel
+from lardhm_torch.learning.clustering import Clusters, points_where
+from lardhm_torch.learning.map_state import MapState, factor_covariances
+from lardhm_torch.points import UNKNOWN, in_morton_order
+
+INSIDE = 6.0  # standard deviations from a surface's cluster: nothing there is unknown ...
+SURFACE = 0.25  # [m] ... nor farther than this from its plane: wider clusters are no surfaces
+TAILS = (2.0, 5.0)  # standard deviations from a cluster: where its tail is
+TAIL_FEATURE = 0.4  # no cluster holds a place where no feature is larger
+TAILS_PER_CLUSTER = 3
+
+
+def off_surfaces(points: Tensor, surfaces: Clusters, floor: float) -> Tensor:
+    """(N, D) positions -> (N,) bool: not inside the nearest cluster of hits.
+
+    Inside is within `INSIDE` standard deviations, and within `SURFACE` of its plane. At grazing
+    incidence a place behind a hit still lies within the surface.
+
+    Args:
+        points: (N, D) positions [m].
+        surfaces: occupied clusters; none: every point is off them.
+        floor: smallest standard deviation [m].
+    """
+    if len(surfaces) == 0 or len(points) == 0:
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+    covariances = surfaces.covariances
+    factors = factor_covariances(covariances, floor)
+    normals = torch.linalg.eigh(covariances).eigenvectors[:, :, 0]
+    owner = native.nearest_centers(points, surfaces.means, 1).squeeze(1)
+    offsets = points - surfaces.means[owner]
+    whitened = torch.linalg.solve_triangular(factors[owner], offsets[:, :, None], upper=False)
+    inside = whitened.squeeze(2).square().sum(dim=1) < INSIDE**2
+    return ~(inside & ((offsets * normals[owner]).sum(dim=1).abs() < SURFACE))
+
+
+def draw_tails(
+    clusters: Clusters, is_occupied: Tensor, floor: float, rng: torch.Generator
+) -> Tensor:
+    """(N, D) positions in the tails of the clusters [m], more where these are large.
+
+    Places are spread over space, not over clusters: a cluster is drawn as often as its volume says,
+    half of them from the occupied ones, which are smaller.
+    """
+    count, dim = TAILS_PER_CLUSTER * len(clusters), clusters.means.shape[1]
+    covariances = clusters.covariances
+    sizes = covariances.diagonal(dim1=1, dim2=2).sum(dim=1).sqrt() + floor
+    volumes = sizes**dim
+    for kind in (is_occupied, ~is_occupied):
+        volumes[kind] /= volumes[kind].sum()
+    chosen = torch.multinomial(volumes, count, replacement=True, generator=rng)
+    factors = factor_covariances(covariances, floor)[chosen]
+    shape = (count, dim)
+    way = torch.randn(shape, generator=rng, device=rng.device).to(factors)
+    low, high = TAILS
+    far = low + (high - low) * torch.rand(count, 1, generator=rng, device=rng.device).to(factors)
+    way *= far / torch.linalg.vector_norm(way, dim=1, keepdim=True)
+    return clusters.means[chosen] + (factors @ way[:, :, None]).squeeze(2)
+
+
+def settle_unknown(
+    points: Tensor, labels: Tensor, state: MapState, kernel: Kernel, rng: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """The samples without unknown points inside surfaces, and with more in the clusters' tails.
+
+    Samples without unknown points are returned as they are.
+
+    Args:
+        points: (N, D) positions [m], map frame, in Morton order.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+        state: M clusters of these samples.
+        kernel: of the map.
+        rng: random state.
+
+    Returns:
+        (N', D) positions and (N',) labels, in Morton order.
+    """
+    is_unknown = labels == UNKNOWN
+    if not bool(is_unknown.any()):
+        return points, labels
+    surfaces = Clusters(*(moments[state.is_occupied] for moments in state.clusters))
+    rows = is_unknown.nonzero().squeeze(1)
+    kept = ~is_unknown
+    kept[rows] = off_surfaces(points[rows], surfaces, kernel.min_lengthscale)
+    tails = draw_tails(state.clusters, state.is_occupied, kernel.min_lengthscale, rng)
+    index = native.build_index(state.centers, kernel.num_neighbors)
+    parameters = (state.centers, state.raw_scale_tril, kernel, index)
+    features = native.nearest_features(tails, *parameters)[1].amax(dim=1)
+    tails = tails[features <= TAIL_FEATURE]
+    labels = torch.cat([labels[kept], labels.new_full((len(tails),), UNKNOWN)])
+    points, labels = in_morton_order(torch.cat([points_where(points, kept), tails]), labels)
+    return points, labels
