@@ -92,7 +92,7 @@ def check_samples(
         wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
         value = strange[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
-        raise ValueError(f"labels must be 0 or 1, or 1/2 where no ray was; got {value}.{cure}")
+        raise ValueError(f"labels must be 0 or 1; got {value}. 1/2 means unknown.{cure}")
     known = labels != UNKNOWN
     if keep_unknown or bool(known.all()):
         return points, labels

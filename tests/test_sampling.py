@@ -145,7 +145,7 @@ def test_split_rays_gives_every_ray_to_one_side():
 
 def test_near_samples_of_a_short_ray_spread_over_its_free_part():
     ends = torch.tensor([[0.4, 0.0, 0.0]]).repeat(500, 1)
-    config = SamplingConfig(free_samples=1, near_samples=8)
+    config = SamplingConfig(free_samples=1, near_samples=8, behind_samples=0)
     samples = sample_rays(Scans(torch.zeros(1, 3), ends), config)
     near = samples.points[-4000:, 0]
     assert float(near.min()) > 0

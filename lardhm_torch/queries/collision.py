@@ -26,7 +26,7 @@ class Mover:
         length: path length over which log-odds of 1 are one expected obstacle [m]. Smaller is more
             cautious.
         step: longest interval of a path that is tested only at its ends [m]; thinner obstacles can
-            be missed. None: half of `surface_step` for segments, all of it for rays.
+            be missed. None: a quarter of `surface_step` for segments, all of it for rays.
     """
 
     radius: float = 0.0
@@ -75,7 +75,7 @@ def segment_hazard(
         )
     result = starts.new_zeros(len(starts))
     boxes = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
-    step = surface_step(model) / 2 if mover.step is None else mover.step
+    step = surface_step(model) / 4 if mover.step is None else mover.step
     for rows, part in local_parts(model, *boxes):
         integral = swept_integral(part, starts[rows], ends[rows], mover.radius, step)
         result = result.index_copy(0, rows, integral / mover.length)

@@ -22,7 +22,7 @@ from lardhm_torch.maps import OccupancyMap, TensorLike, to_tensor
 
 HAZARD_LENGTH = 0.1  # [m] default path length over which log-odds of 1 are one expected obstacle
 SHORTEST = 1e-6  # [m] intervals are not bisected below this length
-NODES = 5  # of the quadrature, per interval
+NODES = 8  # of the quadrature, per interval
 SEGMENTS_AT_ONCE = 1 << 16
 
 
