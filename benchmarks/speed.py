@@ -126,7 +126,7 @@ def train(arguments: argparse.Namespace) -> Result:
 def sgd_schedule(num_points: int) -> tuple[int, int]:
     """Passes and batch size of the defaults, for the system that trains in plain torch."""
     config = FitConfig()
-    return config.passes, config.batch_size or max(256, num_points // 128)
+    return config.passes_over(num_points), config.rows_a_batch(num_points)
 
 
 def paper_note(kind: str) -> str:
@@ -151,7 +151,7 @@ def stages(arguments: argparse.Namespace) -> Result:
     notes = [
         "grid query is one fused pass that holds no features: it stands for the paper's last two "
         "rows together. The paper's times are from 8 cores of 2.5 GHz; its SGD is one pass, ours "
-        f"{FitConfig().passes}."
+        f"{FitConfig().passes_over(len(task.points))}."
     ]
     return {"title": "Stages, Table I", "rows": rows, "notes": notes}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,6 +14,8 @@ from lardhm_torch import native
 from lardhm_torch.maps import TensorLike, to_tensor
 
 CHECK_CHUNK = 1 << 18  # labels checked at a time, so that the check needs little memory
+STRAY = 100.0  # times the spread of the middle 98 % of the points: farther ones are left out
+STRAY_SAMPLE = 1 << 14  # points from which the spread is estimated
 UNKNOWN = 0.5  # label of a point where no ray was
 FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
 
@@ -46,10 +49,51 @@ def training_points(
     labels = labels.to(like.dtype)
     if origin is not None:
         return TrainingPoints(to_map_frame(points, origin, like.dtype), labels, origin)
+    points, labels = _drop_strays(points, labels)
     origin = points.mean(dim=0, dtype=torch.float64).round()
     local = to_map_frame(points, origin, like.dtype)
     local, labels = in_morton_order(local, labels)
     return TrainingPoints(local, labels, origin)
+
+
+def _drop_strays(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """The samples without strays, with warnings where there are strays or no occupied points."""
+    kept = _without_strays(points)
+    if not bool(kept.all()):
+        warnings.warn(
+            f"left out {int((~kept).sum())} of {len(points)} points that are far from all others; "
+            f"the first is {points[~kept][0].tolist()}",
+            stacklevel=4,
+        )
+        points, labels = points[kept], labels[kept]
+    if not bool((labels > UNKNOWN).any()):
+        warnings.warn(
+            f"none of {len(points)} points is occupied, so the map holds free space only. Hits "
+            "beyond max_range of SamplingConfig do not count as hits",
+            stacklevel=4,
+        )
+    return points, labels
+
+
+def _without_strays(points: Tensor) -> Tensor:
+    """(N,) bool: False for points so far from all others that they would spoil the order of those.
+
+    A stray lies more than `STRAY` times the spread of the middle 98 % of the points from their
+    median, along some axis.
+
+    Args:
+        points: (N, D) positions [m], finite.
+    """
+    every = points[:: max(1, len(points) // STRAY_SAMPLE)].double()
+    low, middle, high = every.quantile(every.new_tensor([0.01, 0.5, 0.99]), dim=0)
+    reach = STRAY * (high - low).max()
+    if not bool(reach > 0):
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+    low, high = (middle - reach).to(points), (middle + reach).to(points)
+    lower, upper = points.aminmax(dim=0)
+    if bool((lower >= low).all()) and bool((upper <= high).all()):  # as almost always
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+    return ((points >= low) & (points <= high)).all(dim=1)
 
 
 def check_samples(

@@ -14,6 +14,7 @@ from lardhm_torch.scans import Scans
 
 TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
 PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
+LOST = 0.5  # of the hits outside the range limits: more than that is a mistake of units
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,12 +102,32 @@ def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str,
     finite = ranges.isfinite()  # not if a coordinate of either end is not
     inside = finite & ~(ranges >= max(config.min_range, 1e-9))
     later = finite & ~inside & (scans.target_index > 1)
+    long = finite & scans.is_return & (ranges > config.max_range)
     counts = {
         "not finite": int((~finite).sum()),
         f"shorter than {config.min_range} m": int(inside.sum()),
+        f"hits beyond {config.max_range:g} m (no hit, free space kept)": int(long.sum()),
         "later returns (hit kept, no free space)": int(later.sum()),
     }
     return finite & ~inside, counts
+
+
+def _check_unit(scans: Scans, keep: Tensor, config: SamplingConfig) -> None:
+    """Raise an error if most hits are outside the range limits: coordinates are not in meters."""
+    ranges = scans.ranges
+    rays = scans.is_return & ranges.isfinite() & (ranges > 0)
+    count, short = int(rays.sum()), int((rays & ~keep).sum())
+    long = int((rays & (ranges > config.max_range)).sum())
+    if count and max(short, long) > LOST * count:
+        which = (
+            f"{short} of {count} hits are nearer than min_range = {config.min_range:g} m"
+            if short > long
+            else f"{long} of {count} hits are farther than max_range = {config.max_range:g} m"
+        )
+        raise NoUsableRayError(
+            f"coordinates must be in meters; {which} (median range {float(ranges[rays].median()):.3g}). "
+            "Scale points and sensor positions to meters, or give a SamplingConfig with other limits"
+        )
 
 
 def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
@@ -127,12 +148,14 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
         Labelled points, the hits first.
 
     Raises:
-        NoUsableRayError: no ray is usable; a ValueError whose message says why.
+        NoUsableRayError: no ray is usable, or more than half of the hits are outside the range
+            limits; a ValueError whose message says why.
 
     Source: Guizilini & Ramos 2016, Section II-A.
     """
     config = config or SamplingConfig()
     keep, dropped = usable_rays(scans, config)
+    _check_unit(scans, keep, config)
     if not keep.any():
         raise NoUsableRayError(
             f"scans must hold at least one usable ray of {len(scans)}; got {dropped}"

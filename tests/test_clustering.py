@@ -160,10 +160,10 @@ def test_classes_are_clustered_apart_occupied_first():
     ("sizes", "asked", "given_out"),
     [
         ([1000, 1000], 101, [51, 50]),
-        ([1000, 20], 100, [96, 4]),
-        ([20, 1000], 100, [4, 96]),
+        ([1000, 20], 100, [80, 20]),
+        ([20, 1000], 100, [20, 80]),
         ([1000, 0], 100, [100, 0]),
-        ([3, 3], 500, [1, 1]),
+        ([3, 3], 500, [3, 3]),
     ],
 )
 def test_clusters_are_split_over_the_classes(sizes, asked, given_out):
@@ -177,5 +177,6 @@ def test_clusters_are_as_fine_as_space_unless_starved_or_crowded(points_a_cell, 
     line = (torch.arange(2000, dtype=F64) + 0.5)[:, None] * torch.tensor([0.2, 0.0, 0.0], dtype=F64)
     points = line.repeat(points_a_cell, 1) - 100.0
     assert choose_num_clusters(points) == pytest.approx(len(points) / points_a_cluster, abs=1)
-    assert choose_num_clusters(points[:3]) == 1
+    assert choose_num_clusters(points[:3]) == 3  # in three cells
+    assert choose_num_clusters(points[:3] / 100 + 0.05) == 1
     assert choose_num_clusters(torch.rand(200_000, 3, generator=rng()) * 1e3) == 5000

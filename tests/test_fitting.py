@@ -136,7 +136,7 @@ def test_features_are_computed_once_where_kept_and_else_anew_for_every_two_passe
     def fit_in_chunks():
         calls.clear()
         start = torch.zeros(12, dtype=F64)
-        return fit_weights(features_of, labels, start, FitConfig(batch_size=50))
+        return fit_weights(features_of, labels, start, FitConfig(passes=4, batch_size=50))
 
     whole = fit_in_chunks()
     assert calls == [600]
@@ -166,7 +166,7 @@ def test_every_sample_is_dealt_once_and_every_batch_reaches_over_all_of_them(cou
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"passes": 0}, "passes must be 1 or more; got 0"),
+        ({"passes": 0}, "passes must be 1 or more, or None; got 0"),
         ({"batch_size": 0}, "batch_size must be 1 or more; got 0"),
         ({"learning_rate": 0.0}, "learning_rate must be > 0; got 0"),
         ({"l1": -1.0}, "l1 and l2 must be 0 or more; got -1"),
@@ -227,3 +227,11 @@ def test_all_batches_of_a_pass_are_about_equally_large(count, asked):
     last = count - (batches - 1) * size
     assert size <= (asked or max(256, count // 128))
     assert size - last < batches  # by less than one point a batch
+
+
+def test_few_points_get_as_many_steps_as_many():
+    assert FitConfig().passes_over(10**6) == 4
+    for count in (1, 50, 300, 5000):
+        batches = -(-count // FitConfig().rows_a_batch(count))
+        assert FitConfig().passes_over(count) * batches >= 256
+    assert FitConfig(passes=1).passes_over(50) == 1

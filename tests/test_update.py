@@ -326,6 +326,7 @@ def test_maps_of_any_dimension_learn_a_second_wall(dim, config):
         assert ((model(points) > 0.5) == (labels > 0.5)).double().mean() > 0.95
 
 
+@pytest.mark.filterwarnings("ignore:none of 600 points is occupied")
 def test_one_new_point_and_one_new_class_are_enough_for_an_update():
     model = wall_map()
     model.update(torch.tensor([[50.0, 0.0, 0.0]]), torch.ones(1))

@@ -66,6 +66,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     scans = read_scans(arguments)
     samples = sample_rays(scans, seed=arguments.seed)
     report_dropped(samples.dropped)
+    if not bool((samples.labels == 1).any()):
+        raise ValueError(f"scans must hold at least one hit within range; got {samples.dropped}")
     model = _new_map(scans.dim, arguments)
     model.fit(
         samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True

@@ -26,6 +26,7 @@ MAX_CHOSEN = 5000  # a class
 START_POINTS = 50  # a center, drawn at random, among which the start is chosen
 ITERATIONS = 20  # of k-means: t of Algorithm 1
 VOLUME_ITERATIONS = 5  # the same where clusters fill a volume beside an unknown one: they are many
+FEW_POINTS = 64  # of a class whose points may each be a cluster: hits of a few beams
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
@@ -64,23 +65,34 @@ class Clusters(Columns):
 def cluster_points(
     points: Tensor, num_clusters: int, rng: torch.Generator, iterations: int = ITERATIONS
 ) -> Clusters:
-    """At most ``num_clusters`` clusters of the points, none of fewer than five unless there are fewer.
+    """At most ``num_clusters`` clusters of the points, none of fewer than five unless points are few.
 
     Args:
         points: (N, D) positions of one class [m], in the order of `morton_order`.
-        num_clusters: how many to look for; more than N / 5 means N / 5.
+        num_clusters: how many to look for; at most `most_clusters` of N.
         rng: random state of the start and of the batches.
         iterations: of k-means.
 
     Source: Guizilini & Ramos 2016, Algorithm 1, eq. (6), (7) and Section IV-B.
     """
-    num_clusters = max(1, min(num_clusters, len(points) // MIN_COUNT))
+    num_clusters = max(1, min(num_clusters, most_clusters(len(points))))
     centers = mini_batch_kmeans(points, num_clusters, rng, iterations=iterations)
     _, counts, sums, scatters = native.assign(points, centers)
-    clusters = merge_small(clusters_about(centers, counts, sums, scatters))
+    min_count = min(MIN_COUNT, max(1, len(points) // num_clusters))
+    clusters = merge_small(clusters_about(centers, counts, sums, scatters), min_count)
     # Neighbors in space are neighbors in memory: queries of large maps are faster.
     order = morton_order(clusters.means)
     return Clusters(*(moments[order] for moments in clusters))
+
+
+def most_clusters(num_points: int) -> int:
+    """How many clusters so many points of a class can have: five points each, a few points one."""
+    return max(num_points // MIN_COUNT, _few(num_points))
+
+
+def _few(num_points: int) -> int:
+    """How many clusters of fewer than five points there may be: none from 2 `FEW_POINTS` on."""
+    return max(0, min(num_points, 2 * FEW_POINTS - num_points))
 
 
 def cluster_classes(
@@ -175,7 +187,7 @@ def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
     By `class_shares`, what does not go round to the occupied class; a class that cannot fill its
     share (five points a cluster) leaves the rest to the others.
     """
-    room = [max(1, size // MIN_COUNT) if size else 0 for size in class_sizes]
+    room = [most_clusters(size) for size in class_sizes]
     num_unknown = room[2] if len(room) > 2 else 0
     shares = class_shares(num_unknown)
     unknown = min(num_unknown, num_clusters * shares[2] // sum(shares))
@@ -196,7 +208,7 @@ def scan_clusters(classes: list[Tensor]) -> list[int]:
         classes: (N, D) occupied and (F, D) free positions [m].
     """
     chosen = choose_num_clusters(classes[0] if len(classes[0]) else classes[1], fine=True)
-    rooms = [max(1, len(members) // MIN_COUNT) if len(members) else 0 for members in classes]
+    rooms = [most_clusters(len(members)) for members in classes]
     return [min(chosen, room) for room in rooms]
 
 
@@ -205,8 +217,10 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
 
     One for every `CELLS_PER_CLUSTER` cells with points in them, so that clusters are as fine as the
     scene is large; of at least `POINTS_PER_CLUSTER` points on average, or they would be starved and
-    accuracy fall (paper, Section IV-B), and of at most `DENSE_POINTS`. The number of free points says
-    what the sampler was asked for, and nothing about the scene.
+    accuracy fall (paper, Section IV-B), and of at most `DENSE_POINTS`. Up to
+    `FEW_POINTS` points in different cells may have a cluster each: a cluster of beams that end far
+    apart would reach across the room. The number of free points says what the sampler was asked
+    for, and nothing about the scene.
 
     Args:
         points: (N, D) positions [m].
@@ -216,8 +230,10 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
     strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
     # neighbors mostly follow each other: what is left to sort is a fraction of the points
     count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
-    count //= CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER
-    finest, coarsest = len(points) // POINTS_PER_CLUSTER, len(points) // DENSE_POINTS
+    few = min(count, _few(len(points)))
+    count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
+    finest = max(len(points) // POINTS_PER_CLUSTER, few)
+    coarsest = len(points) // DENSE_POINTS
     return max(1, min(max(count, coarsest), finest, MAX_CHOSEN))
 
 

@@ -17,6 +17,7 @@ from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.unseen import settle_unknown
 
 CHUNK_ROWS = 1 << 21  # points whose features are computed at a time
+PASSES, MIN_STEPS = 4, 256  # a few beams make a single batch: four steps would teach nothing
 CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
 State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the slope
 FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
@@ -31,7 +32,7 @@ class FitConfig:
     batch_size=1)``; it leaves log-loss on the table (docs and benchmarks show how much).
     """
 
-    passes: int = 4  # over all points
+    passes: int | None = None  # over all points; None: 4, or as many as make `MIN_STEPS` steps
     batch_size: int | None = None  # points a step; None: N / 128, at least 256
     learning_rate: float = 0.5  # eta of eq. (4)
     decay: bool = True  # eta falls linearly to 0; otherwise constant
@@ -49,9 +50,14 @@ class FitConfig:
         wanted = self.batch_size or max(256, num_points // 128)
         return -(-num_points // -(-num_points // wanted)) if num_points else wanted
 
+    def passes_over(self, num_points: int) -> int:
+        """Passes over so many points."""
+        batches = max(1, -(-num_points // self.rows_a_batch(num_points)))
+        return self.passes or max(PASSES, -(-MIN_STEPS // batches))
+
     def __post_init__(self) -> None:
-        if self.passes < 1:
-            raise ValueError(f"passes must be 1 or more; got {self.passes}")
+        if self.passes is not None and self.passes < 1:
+            raise ValueError(f"passes must be 1 or more, or None; got {self.passes}")
         if self.batch_size is not None and self.batch_size < 1:
             raise ValueError(f"batch_size must be 1 or more; got {self.batch_size}")
         if not self.learning_rate > 0:
@@ -206,17 +212,18 @@ def fit_weights(
         shares = (config.occupied_share, config.unknown_share)
         factors = balance_classes(labels, *shares) if config.balance else torch.ones_like(labels)
     batch_size = config.rows_a_batch(len(labels))
-    plan = _Plan(config, batch_size, len(labels), config.passes * -(-len(labels) // batch_size))
+    passes = config.passes_over(len(labels))
+    plan = _Plan(config, batch_size, len(labels), passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))
     state = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights))
     step = 0
-    for passed in tqdm(range(config.passes), "weights", disable=None if progress else True):
+    for passed in tqdm(range(passes), "weights", disable=None if progress else True):
         for rows in features.chunks(len(labels)):
             if passed % 2 and not features.keeps(rows):
                 continue
             chunk = _Chunk(*features[rows], labels[rows], factors[rows])
             steps = _native_steps if native.descends(*chunk[:2]) else _plain_steps
-            for _ in range(1 if features.keeps(rows) else min(2, config.passes - passed)):
+            for _ in range(1 if features.keeps(rows) else min(2, passes - passed)):
                 state = steps(chunk, state, step, plan)
                 step += -(-len(chunk.labels) // batch_size)
     return state[0]

@@ -53,7 +53,7 @@ SMOOTHER = 2.0  # free space than surfaces: so many times the points before a cl
 REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
 LOOKED_AT = 4  # times as many points may contradict old clusters as train the weights
 # The map recalls its own leaning to hits, so that new points need no more of it.
-UPDATE_FIT = FitConfig(passes=4, batch_size=1024, l2=0.01, occupied_share=0.5)
+UPDATE_FIT = FitConfig(batch_size=1024, l2=0.01, occupied_share=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
