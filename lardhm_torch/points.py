@@ -147,6 +147,8 @@ def check_samples(
 
 def _are_labels(values: Tensor) -> bool:
     """Whether all values are 0, 1/2 or 1: the zeros of y (2 y - 1) (y - 1)."""
+    if values.dtype == torch.bool:
+        return True
     return bool((values * (2 * values - 1) * (values - 1) == 0).all())
 
 

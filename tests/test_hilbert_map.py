@@ -344,6 +344,7 @@ def test_arrays_and_lists_work_where_tensors_do():
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     labels = (points[:, 0] > 0.5).long()
     model = LardHilbertMap().fit(points, labels, 10)
+    assert torch.equal(LardHilbertMap().fit(points, labels.bool(), 10).weights, model.weights)
     for convert in (lambda t: t.numpy(), lambda t: t.tolist()):
         other = LardHilbertMap().fit(convert(points), convert(labels), 10)
         assert torch.equal(other.weights, model.weights)
