@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.io.paths import natural_key
-from lardhm_torch.io.poses import find_beside, read_poses
+from lardhm_torch.io.pose_files import read_trajectory
+from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.records import read_table
 from lardhm_torch.io.trajectories import MAX_STAMP_GAP, Trajectory, check_rigid, move_points
