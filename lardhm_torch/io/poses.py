@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import POSE_FILES, natural_key
 from lardhm_torch.io.records import read_table
 from lardhm_torch.io.trajectories import (
@@ -71,12 +73,30 @@ def find_beside(path: Path, names: tuple[str, ...]) -> Path | None:
     return next((f / n for f in folders for n in names if (f / n).is_file()), None)
 
 
-def pose_beside(path: Path) -> NDArray[np.float64] | None:
-    """(4, 4) world_from_sensor of a scan file, from a pose file beside it or one folder up.
+@dataclass(frozen=True)
+class FoundPose:
+    """The pose of one scan file.
+
+    Args:
+        world_from_sensor: (4, 4); None where the pose file covers the scan with no pose, and the
+            scan is left out.
+        notes: from which file, by which rule, and what was guessed.
+    """
+
+    world_from_sensor: NDArray[np.float64] | None
+    notes: tuple[Note, ...]
+
+
+def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
+    """The pose of a scan file, from a pose file beside it or one folder up; None without one.
 
     KITTI lines: scan 000123 has line 123 (counted from 0); where the names are no such numbers,
     lines follow their natural order. TUM lines: by stamp where all names are stamps (in seconds,
     or whole microseconds or nanoseconds), else in natural order.
+
+    Args:
+        path: of the scan.
+        poses_frame: whose poses the file holds, "camera" or "lidar"; None: not said.
 
     Raises:
         ValueError: the pose file is broken, or has no pose for the scan.
@@ -85,7 +105,8 @@ def pose_beside(path: Path) -> NDArray[np.float64] | None:
     if source is None:
         return None
     stamps = (_changed(path.parent), _changed(source), _changed(source.with_name("calib.txt")))
-    return _pose_of_each(path.parent, path.suffix.lower(), source, stamps)[path.name]
+    pose = _pose_of_each(path.parent, path.suffix.lower(), source, stamps)[path.name]
+    return FoundPose(pose, (Note(f"pose from {source.name}"),))
 
 
 def _changed(path: Path) -> int:
