@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from lardhm_torch.io.frames import moved
 from lardhm_torch.io.poses import pose_beside
 from lardhm_torch.io.readout import Readout
-from lardhm_torch.io.trajectories import move_points
 
 _POINT_BYTES = 16
 
 
-def read_kitti(path: Path) -> Readout:
+def read_kitti(path: Path, poses_frame: str | None = None) -> Readout:
     """Points moved into the world by the scan's pose (`poses.pose_beside`); without one, as they are.
 
     The format has no header: a file cut between two points looks whole.
@@ -27,7 +27,6 @@ def read_kitti(path: Path) -> Readout:
             f"points of {_POINT_BYTES} bytes (float32 x y z intensity) are needed; got {size} bytes"
         )
     ends = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
-    pose = pose_beside(path)
-    if pose is None:
-        return Readout(ends, origin_cure="Put its poses.txt beside it")
-    return Readout(move_points(pose, ends), origins=pose[None, :3, 3].copy())
+    pose = pose_beside(path, poses_frame)
+    readout = Readout(ends, origin_cure="Put its poses.txt beside it")
+    return readout if pose is None else moved(readout, pose)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lardhm_torch.io.notes import Note
 
 COLUMN_NAMES = frozenset(
     {"x", "y", "z", "ox", "oy", "oz", "scan_id", "is_return", "target_index", "return_number"}
@@ -19,13 +21,15 @@ class Readout:
 
     Args:
         ends: (R, D) float64 ray ends, world frame [m].
-        origins: (S, D) float64 sensor positions [m].
+        origins: (S, D) float64 sensor positions [m]; a row of NaN: not known for this scan.
         scan_id: (R,) int64 index into origins.
         is_return: (R,) bool.
         target_index: (R,) int64, 1 = first return of a pulse.
         world_from_sensor: (4, 4) pose the file carries, which has not moved its points.
         origin_is_placeholder: origins is what writers put when they know no pose.
         origin_cure: how a file of this format can carry its sensor position.
+        notes: what was assumed or left out.
+        times: (R,) float64 when each ray was measured [s], in the clock of the file.
     """
 
     ends: NDArray[np.float64]
@@ -36,6 +40,12 @@ class Readout:
     world_from_sensor: NDArray[np.float64] | None = None
     origin_is_placeholder: bool = False
     origin_cure: str = "Add columns ox oy oz"
+    notes: tuple[Note, ...] = ()
+    times: NDArray[np.float64] | None = None
+
+    def noting(self, *notes: Note) -> Readout:
+        """The same with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
 
     @property
     def dim(self) -> int:
@@ -45,11 +55,15 @@ class Readout:
     @property
     def needs_origin(self) -> bool:
         """Whether a sensor position given by the caller has a place here."""
-        return self.origins is None or self.origin_is_placeholder
+        if self.origins is None or self.origin_is_placeholder:
+            return True
+        return bool(np.isnan(self.origins).any())
 
     @property
     def num_scans(self) -> int:
         """Number of scans S."""
+        if self.origins is not None:
+            return len(self.origins)
         if self.scan_id is None or not len(self.scan_id):
             return 1
         return int(self.scan_id.max()) + 1
