@@ -126,7 +126,11 @@ def _is_fixed(sources: PoseSources, frame: str) -> bool:
 
 
 def _has_fixed_name(frame: str) -> bool:
-    return not _FIXED.isdisjoint(re.split(r"[/_\-.\s]+", frame.lower()))
+    return not _FIXED.isdisjoint(_words(frame))
+
+
+def _words(frame: str) -> list[str]:
+    return re.split(r"[/_\-.\s]+", frame.lower())
 
 
 def _sensors_below(tree: TransformTree, frame: str) -> list[str]:
@@ -147,23 +151,27 @@ def _by_tf(tree: TransformTree, frame: str, stamps: NDArray[np.float64]) -> Clou
 def _seen_from_sensor(
     sources: PoseSources, frame: str, poses: CloudPoses, stamps: NDArray[np.float64]
 ) -> CloudPoses:
-    """The same where the caller names the sensor's frame, and it is not the clouds' own."""
-    below = [] if sources.sensor_frame else _sensors_below(sources.tree, frame)
-    if below:
+    """The same, seen from the sensor where it is not at the origin of the clouds' frame.
+
+    Drivers publish clouds in the sensor's frame; clouds in that of a robot's base were moved there.
+    """
+    below = _sensors_below(sources.tree, frame)
+    is_base = "base" in _words(frame)
+    sensor = sources.sensor_frame or (below[0] if is_base and len(below) == 1 else frame)
+    if sensor == frame:
+        if not below or sources.sensor_frame:
+            return poses
         cure = f"sensor_frame='{frame}' confirms it; below it are {', '.join(below[:5])}"
-        note = Note(f"sensor taken to be at the origin of {frame}", cure=cure)
+        note = Note(f"sensor taken to be at the origin of {frame}", cure=cure, is_loss=is_base)
         return replace(poses, notes=(*poses.notes, note))
-    if sources.sensor_frame in (None, frame):
-        return poses
-    found = sources.tree.between(frame, sources.sensor_frame, stamps)
+    found = sources.tree.between(frame, sensor, stamps)
     if found is None:
-        raise ValueError(f"tf must connect {frame} and {sources.sensor_frame}; it does not")
-    return CloudPoses(
-        poses.world_from_cloud,
-        (poses.world_from_cloud @ found[0])[:, :3, 3],
-        np.maximum(poses.gaps, found[1]),
-        (*poses.notes, Note(f"sensor at {sources.sensor_frame}, as given")),
-    )
+        raise ValueError(f"tf must connect {frame} and {sensor}; it does not")
+    cure = "" if sources.sensor_frame else f"sensor_frame='{sensor}' confirms it"
+    note = Note(f"clouds are in {frame}; sensor taken to be at {sensor}", cure=cure)
+    positions = (poses.world_from_cloud @ found[0])[:, :3, 3]
+    gaps = np.maximum(poses.gaps, found[1])
+    return CloudPoses(poses.world_from_cloud, positions, gaps, (*poses.notes, note))
 
 
 def _seen_in_fixed_frame(

@@ -162,8 +162,10 @@ def _readout(clouds: list[Cloud], poses: CloudPoses, notes: list[Note]) -> Reado
     is_placed = poses.gaps <= MAX_STAMP_GAP
     if not is_placed.any():
         nearest = poses.gaps.min()
-        got = f"off by {nearest:.3g} s" if np.isfinite(nearest) else "before or after all clouds"
-        raise ValueError(f"a pose within {MAX_STAMP_GAP} s of a cloud is needed; the nearest is {got}")
+        got = "all clouds are before the first or after the last one"
+        if np.isfinite(nearest):
+            got = f"the nearest is off by {nearest:.3g} s"
+        raise ValueError(f"a pose within {MAX_STAMP_GAP} s of a cloud is needed; {got}")
     num_outside, num_far = np.isinf(poses.gaps).sum(), np.isfinite(poses.gaps[~is_placed]).sum()
     if num_outside:
         text = f"of {len(clouds)} clouds left out: before the first or after the last pose"
