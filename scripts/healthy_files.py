@@ -210,7 +210,9 @@ class BagMaker:
         """A CustomMsg of Livox's driver."""
         kind, whole = "livox_ros_driver2/msg/CustomMsg", round(stamp * 1e9)
         rows = [
-            self._make("livox_ros_driver2/msg/CustomPoint", 1000 * i, *map(float, row), 7, 16, i % 4)
+            self._make(
+                "livox_ros_driver2/msg/CustomPoint", 1000 * i, *map(float, row), 7, 16, i % 4
+            )
             for i, row in enumerate(points)
         ]
         unused = np.zeros(3, np.uint8)

@@ -67,9 +67,7 @@ def clouds_by_rosbags(path: Path) -> np.ndarray:
 
 
 def in_the_world(clouds: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    return np.concatenate(
-        [c @ p[:3, :3].T + p[:3, 3] for c, p in zip(clouds, poses, strict=True)]
-    )
+    return np.concatenate([c @ p[:3, :3].T + p[:3, 3] for c, p in zip(clouds, poses, strict=True)])
 
 
 @pytest.mark.parametrize("ending", [".mcap", ".db3"])
@@ -88,14 +86,18 @@ def test_metadata_with_folder_names_in_its_paths_is_understood(tmp_path):
 def test_a_part_that_metadata_lists_and_is_missing_is_an_error(tmp_path, ending):
     bag = write_parts(tmp_path / "bag", ending)
     (bag / f"bag_1{ending}").unlink()
-    with pytest.raises(ValueError, match=rf"bag cannot.*lists bag_1{ending}, which is missing.*rein"):
+    with pytest.raises(
+        ValueError, match=rf"bag cannot.*lists bag_1{ending}, which is missing.*rein"
+    ):
         load_scans(bag)
 
 
 def test_a_part_that_is_still_compressed_is_an_error(tmp_path):
     bag = write_parts(tmp_path / "bag")
     (bag / "bag_1.mcap").rename(bag / "bag_1.mcap.zstd")
-    with pytest.raises(ValueError, match=r"bag_1\.mcap\.zstd is still compressed\. Unpack it: zstd"):
+    with pytest.raises(
+        ValueError, match=r"bag_1\.mcap\.zstd is still compressed\. Unpack it: zstd"
+    ):
         load_scans(bag)
     names = [f"bag_{number}.mcap.zstd" for number in range(3)]
     (bag / "metadata.yaml").write_text(metadata_of(names, 6))
@@ -192,7 +194,10 @@ def killed_recorder(folder: Path, journal: str) -> Path:
 def test_the_log_that_a_killed_recorder_left_is_merged(tmp_path, journal):
     path = killed_recorder(tmp_path / "bag", journal)
     before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
-    assert set(before) == {"bag_0.db3", "bag_0.db3-wal" if journal == "WAL" else "bag_0.db3-journal"}
+    assert set(before) == {
+        "bag_0.db3",
+        "bag_0.db3-wal" if journal == "WAL" else "bag_0.db3-journal",
+    }
     report = ScanReport()
     for place in (path, path.parent):  # there is no metadata.yaml yet either
         assert_rays(load_scans(place, report=report), DRIVE)

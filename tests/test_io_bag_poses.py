@@ -40,7 +40,9 @@ def test_rays_of_registered_clouds_start_at_the_sensor(tmp_path, name, fixed):
     report = ScanReport()
     path = write_bag(tmp_path / name, lambda maker: registered(maker, fixed))
     assert_rays(load_scans(path, report=report), DRIVE, 2e-6)
-    assert f"clouds are in {fixed}; sensor taken to be at lidar (guess: sensor_frame=" in str(report)
+    assert f"clouds are in {fixed}; sensor taken to be at lidar (guess: sensor_frame=" in str(
+        report
+    )
     with pytest.raises(ValueError, match="strict reading refuses a guess: clouds are in"):
         load_scans(path, strict=True)
     assert_rays(load_scans(path, sensor_frame="lidar", strict=True), DRIVE, 2e-6)
@@ -49,12 +51,16 @@ def test_rays_of_registered_clouds_start_at_the_sensor(tmp_path, name, fixed):
 def test_of_several_possible_sensors_of_registered_clouds_one_must_be_named(tmp_path):
     links = ("lidar", "imu", "camera")
     path = write_bag(tmp_path / "a.mcap", lambda maker: registered(maker, sensor_links=links))
-    with pytest.raises(ValueError, match="may be any of camera, imu, lidar. Name it: .*sensor_fr"):
+    with pytest.raises(
+        ValueError, match=r"may be any of camera, imu, lidar\. Name it: .*sensor_fr"
+    ):
         load_scans(path)
     assert_rays(load_scans(path, sensor_frame="lidar"), DRIVE, 2e-6)
     of_imu = load_scans(path, sensor_frame="imu")
     np.testing.assert_allclose(of_imu.origins, DRIVE.of_base[:, :3, 3], atol=1e-9)
-    with pytest.raises(ValueError, match="frame laser must be a frame of tf; got base, camera, imu"):
+    with pytest.raises(
+        ValueError, match="frame laser must be a frame of tf; got base, camera, imu"
+    ):
         load_scans(path, sensor_frame="laser")
 
 
@@ -91,7 +97,9 @@ def test_registered_clouds_without_any_pose_of_the_sensor_are_refused(tmp_path):
             yield maker.cloud(scan, 10.0 + number, frame="odom")
 
     path = write_bag(tmp_path / "a.db3", messages)
-    with pytest.raises(ValueError, match=r"in odom, a fixed frame: where the sensor stood must come"):
+    with pytest.raises(
+        ValueError, match=r"in odom, a fixed frame: where the sensor stood must come"
+    ):
         load_scans(path)
     assert load_scans(path, sensor_frame="odom").num_scans == 3
 
@@ -161,7 +169,7 @@ def test_clouds_beyond_the_trajectory_are_left_out_with_a_warning(tmp_path, sour
         scans = load_scans(path)
     np.testing.assert_allclose(scans.origins[:, 0], [15 * 0.45, 15 * 0.9], atol=1e-6)
     path = write_bag(tmp_path / "b.bag", lambda maker: messages(maker, (9.8, 11.2), times))
-    with pytest.raises(ValueError, match="a pose .* is needed; all clouds are before the first"):
+    with pytest.raises(ValueError, match=r"a pose .* is needed; all clouds are before the first"):
         load_scans(path)
     times = times[[0, 9]]
     path = write_bag(tmp_path / "c.bag", lambda maker: messages(maker, (10.2, 10.5), times))
@@ -182,7 +190,9 @@ def test_two_parents_are_an_error_only_for_frames_above_the_clouds(tmp_path):
     path = write_bag(tmp_path / "a.mcap", lambda maker: messages(maker, "arm"))
     assert_rays(load_scans(path), DRIVE)
     path = write_bag(tmp_path / "b.mcap", lambda maker: messages(maker, "lidar"))
-    with pytest.raises(ValueError, match=r"lidar must have one parent; got gnss and odom. .*topic="):
+    with pytest.raises(
+        ValueError, match=r"lidar must have one parent; got gnss and odom. .*topic="
+    ):
         load_scans(path)
     assert_rays(load_scans(path, topic="/odom"), DRIVE)
 

@@ -200,7 +200,8 @@ def _seen_by_topic(
     sources: PoseSources, frame: str, stamps: NDArray[np.float64]
 ) -> CloudPoses | None:
     """The same by a topic of poses."""
-    topic, world = sources.topics[0], (np.tile(np.eye(4), (len(stamps), 1, 1)), 0.0)
+    topic = sources.topics[0]
+    world = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps))
     if topic.frame and topic.frame != frame:
         connected = sources.tree.between(topic.frame, frame, stamps)
         if connected is None:

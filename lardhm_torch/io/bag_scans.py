@@ -74,7 +74,9 @@ def read_bag(
         raise ValueError(_topic_error(f"the name {unknown[0]}", [], bag))
     cloud_topics = _topics_of(bag, CLOUDS, topics)
     if len(cloud_topics) != 1:
-        raise ValueError(_topic_error("PointCloud2, LaserScan or CustomMsg", cloud_topics, bag))
+        raise ValueError(
+            _topic_error("clouds (PointCloud2, LaserScan, CustomMsg)", cloud_topics, bag)
+        )
     clouds = sorted(bag.clouds[cloud_topics[0]], key=lambda cloud: cloud.recorded)
     frame = _common_frame(clouds)
     pose_topics = _topics_of(bag, POSE_OF, topics)
@@ -131,7 +133,7 @@ def _topics_of(bag: _Bag, kinds: Iterable[str], topics: Sequence[str]) -> list[s
 def _topic_error(what: str, found: list[str], bag: _Bag) -> str:
     if found:
         return (
-            f"{len(found)} topics are {what}: {', '.join(sorted(found))}. Name one: "
+            f"{len(found)} topics hold {what}: {', '.join(sorted(found))}. Name one: "
             "load_scans(path, topic=...), --topic on the command line"
         )
     seen = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items())[:12])

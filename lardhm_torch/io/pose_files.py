@@ -20,7 +20,9 @@ from lardhm_torch.io.trajectories import (
 
 _MAX_LINES_BEFORE = 1000
 _TUM = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")
-_STAMP_NAME = re.compile(r"(time|stamp|timestamp|timestamps|t|sec|secs|seconds|unix\w*)(_?[nmu]?s)?")
+_STAMP_NAME = re.compile(
+    r"(time|stamp|timestamp|timestamps|t|sec|secs|seconds|unix\w*)(_?[nmu]?s)?"
+)
 _POSITION_NAME = re.compile(r"(?:t|p|p_\w+|pos|position|trans|translation)?[_.]?([xyz])")
 _TURN_NAME = re.compile(r"(?:q|q_\w+|quat|quaternion|ori|orientation|rot|rotation)[_.]?([wxyz])")
 _UNITS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3}
@@ -177,13 +179,11 @@ def _kitti(path: Path, rows: NDArray[np.float64]) -> PoseFile:
     numbers = None
     if rows.shape[1] == 13:
         if not (np.isfinite(rows[:, 0]).all() and (rows[:, 0] % 1 == 0).all()):
-            raise ValueError(
-                f"{path} must begin its lines of 13 numbers with the number of a scan"
-            )
+            raise ValueError(f"{path} must begin its lines of 13 numbers with the number of a scan")
         numbers, rows = rows[:, 0].astype(np.int64), rows[:, 1:]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
-    is_pose = np.isfinite(poses).all(axis=(1, 2))
+    is_pose: NDArray[np.bool_] = np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
     if not is_pose.any():
         raise ValueError(f"{path} must hold finite poses; no line does")
     check_rigid(np.where(is_pose[:, None, None], poses, np.eye(4)), str(path))
@@ -193,5 +193,7 @@ def _kitti(path: Path, rows: NDArray[np.float64]) -> PoseFile:
 
 
 def _count_missing(is_pose: NDArray[np.bool_], path: Path) -> tuple[Note, ...]:
-    text = f"{int((~is_pose).sum())} lines of {path.name} hold no pose (NaN or a quaternion of zeros)"
+    text = (
+        f"{int((~is_pose).sum())} lines of {path.name} hold no pose (NaN or a quaternion of zeros)"
+    )
     return () if is_pose.all() else (Note(text),)

@@ -127,7 +127,7 @@ def _tum_frames(folder: Path) -> tuple[list[_Frame], int]:
         stamps.append(float(words[0]))
         images.append(folder / words[1])
     source = find_beside(folder / "depth.txt", ("groundtruth.txt",))
-    poses = None if source is None else read_poses(source)
+    poses = None if source is None else read_trajectory(source)
     if not isinstance(poses, Trajectory) or not len(poses.stamps):
         raise ValueError(
             "poses are needed beside depth.txt: groundtruth.txt, stamp tx ty tz qx qy qz qw a line"
