@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -82,11 +82,13 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
     files = [path.parent, source, *_calibrations(source, path)]
     stamps = tuple((str(file), file.stat().st_mtime_ns) for file in files)
     matched = _pose_of_each(path.parent, path.suffix.lower(), source, poses_frame, stamps)
-    pose = matched.poses[path.name]
+    pose, notes = matched.poses[path.name], matched.notes
+    if path.name != next(iter(matched.poses)):  # warnings are for the whole folder: once is enough
+        notes = tuple(replace(note, is_loss=False) for note in notes)
     if np.isfinite(pose).all():
-        return FoundPose(pose, matched.notes)
+        return FoundPose(pose, notes)
     lost = Note(f"scans left out: {source.name} has no pose for them", 1, is_loss=True)
-    return FoundPose(None, (lost, *matched.notes))
+    return FoundPose(None, (lost, *notes))
 
 
 def _calibrations(*files: Path) -> list[Path]:
