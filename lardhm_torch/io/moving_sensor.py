@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import POSE_FILES
-from lardhm_torch.io.pose_files import read_named_columns
+from lardhm_torch.io.pose_files import read_track
 from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.trajectories import MAX_STAMP_GAP, STAMP_ROUNDING
@@ -21,7 +21,7 @@ _FARTHEST = 50e3  # [m] from the points: positions in other coordinates are fart
 _WEEK = 604_800.0  # [s]
 _ADJUSTED = 1e9  # [s] LAS counts "adjusted standard GPS time" from here
 _UNIX = 315_964_800.0 - 18.0  # [s] GPS time counts from 1980 and, since 2017, is 18 s ahead
-_TRACK_COLUMNS = (4, 7, 8)  # time x y z, then roll pitch heading, or a quaternion
+_TRACK_FILES = (*POSE_FILES, "sbet.txt")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def seen_from_track(readout: Readout, file: Path) -> Readout | None:
     Raises:
         ValueError: the trajectory is none, or does not cover the points.
     """
-    source = find_beside(file, POSE_FILES)
+    source = find_beside(file, _TRACK_FILES)
     if source is None or readout.times is None or readout.dim != 3:
         return None
     track, is_only_track = _read_track(source, source.stat().st_mtime_ns)
@@ -97,16 +97,10 @@ def seen_from_track(readout: Readout, file: Path) -> Readout | None:
 @lru_cache(maxsize=2)
 def _read_track(path: Path, changed: int) -> tuple[Track | None, bool]:
     """Positions over time, and whether the file can be nothing else; None for KITTI's lines."""
-    rows, columns, scale = read_named_columns(path, ("stamp", "x", "y", "z"))
-    if rows is None and columns not in _TRACK_COLUMNS:
-        return None, False
+    rows, columns = read_track(path)
     if rows is None:
-        rows, _, scale = read_named_columns(path, ())
-    assert rows is not None
-    rows = rows[np.isfinite(rows[:, :4]).all(axis=1), :4]
-    if not len(rows):
-        raise ValueError(f"{path} must hold lines of time x y z; it has none")
-    stamps, first = np.unique(rows[:, 0] * scale, return_index=True)
+        return None, False
+    stamps, first = np.unique(rows[:, 0], return_index=True)
     return Track(stamps, rows[first, 1:]), columns != 8
 
 

@@ -20,11 +20,16 @@ from lardhm_torch.io.trajectories import (
 
 _MAX_LINES_BEFORE = 1000
 _TUM = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")
+_TRACK_COLUMNS = (4, 7, 8)  # time x y z, then nothing, roll pitch heading, or a quaternion
 _STAMP_NAME = re.compile(
-    r"(time|stamp|timestamp|timestamps|t|sec|secs|seconds|unix\w*)(_?[nmu]?s)?"
+    r"(?:gps_?)?(time|stamp|timestamp|timestamps|t|sec|secs|seconds|unix\w*)(_?[nmu]?s)?"
 )
 _POSITION_NAME = re.compile(r"(?:t|p|p_\w+|pos|position|trans|translation)?[_.]?([xyz])")
 _TURN_NAME = re.compile(r"(?:q|q_\w+|quat|quaternion|ori|orientation|rot|rotation)[_.]?([wxyz])")
+_POSITION_WORDS = {
+    **{"easting": "x", "northing": "y"},
+    **dict.fromkeys(("height", "altitude", "elevation"), "z"),
+}
 _UNITS = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3}
 
 
@@ -98,6 +103,30 @@ def read_trajectory(path: Path) -> Trajectory:
     return file.trajectory()
 
 
+def read_track(path: Path) -> tuple[NDArray[np.float64] | None, int]:
+    """(L, 4) stamp [s] x y z of lines of time x y z and what follows, and the numbers of a line.
+
+    Lines have 4 numbers, 7 (roll, pitch and heading follow), 8 (TUM's), or a comment before them
+    names the columns (such as GPS_TIME EASTING NORTHING HEIGHT). None for other files.
+
+    Raises:
+        ValueError: a word is no number, or no line is finite.
+    """
+    before, columns, delimiter = _beginning(path)
+    named = _named_columns(before, columns, _TUM[:4])
+    if named is None and columns not in _TRACK_COLUMNS:
+        return None, columns
+    wanted = [named[name] for name in _TUM[:4]] if named else [0, 1, 2, 3]
+    try:
+        rows = read_table(path, len(before), wanted, delimiter=delimiter)
+    except ValueError as error:
+        raise ValueError(f"{path} must have {columns} numbers a line: {error}") from error
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
+        raise ValueError(f"{path} must hold lines of time x y z; none is finite")
+    return rows * [_seconds(rows[:, 0], before), 1, 1, 1], columns
+
+
 def _beginning(path: Path) -> tuple[list[str], int, str | None]:
     """Lines before the first line of numbers, how many numbers it has, what parts them."""
     before: list[str] = []
@@ -122,8 +151,10 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _named_columns(before: list[str], columns: int) -> dict[str, int] | None:
-    """Where each number of a TUM line is, by the last comment that names them all."""
+def _named_columns(
+    before: list[str], columns: int, wanted: tuple[str, ...] = _TUM
+) -> dict[str, int] | None:
+    """Where each wanted number of a line is, by the last comment that names them all."""
     for comment in reversed(before):
         text = re.sub(r"\[[^\]]*\]|\([^)]*\)", "", comment.lstrip("#/% \t").lower())
         names = [word.strip() for word in re.split(r"[,;]" if "," in text else r"\s+", text)]
@@ -131,11 +162,13 @@ def _named_columns(before: list[str], columns: int) -> dict[str, int] | None:
         for column, name in enumerate(names[:columns]):
             if _STAMP_NAME.fullmatch(name.lstrip("#")) and "stamp" not in found:
                 found["stamp"] = column
+            elif name in _POSITION_WORDS:
+                found.setdefault(_POSITION_WORDS[name], column)
             elif match := _POSITION_NAME.fullmatch(name):
                 found.setdefault(match[1], column)
             elif match := _TURN_NAME.fullmatch(name):
                 found.setdefault("q" + match[1], column)
-        if found.keys() >= set(_TUM):
+        if found.keys() >= set(wanted):
             return found
     return None
 
