@@ -30,16 +30,23 @@ class Camera:
         intrinsics: fx, fy, cx, cy of the pinhole [pixels], lens distortion removed; None: a file
             camera-intrinsics.txt beside the images.
         pixel_step: every how many pixels of a row and of a column are read; 1: all of them.
+        depth_scale: units of the images per meter; None: 1000 in the 7-Scenes layout, 5000 in
+            TUM's.
     """
 
     intrinsics: tuple[float, float, float, float] | None = None
     pixel_step: int = 4
+    depth_scale: float | None = None
 
     def __post_init__(self) -> None:
         if self.intrinsics is not None:
             _check_intrinsics(tuple(self.intrinsics), "intrinsics")
         if not isinstance(self.pixel_step, int) or self.pixel_step < 1:
             raise ValueError(f"pixel_step must be 1 pixel or more; got {self.pixel_step!r}")
+        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
+            raise ValueError(
+                f"depth_scale must be > 0 units per meter and finite; got {self.depth_scale}"
+            )
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,7 @@ _PIECE_READERS: dict[str, Callable[[Path, int], Iterator[Readout]]] = {
     ".laz": las_pieces,
 }
 _POINT_READERS = {**_READERS, ".npz": read_npz_points, ".npy": read_npy}
+SCAN_SUFFIXES = frozenset(_READERS)
 _BAGS = (".bag", ".db3", ".mcap", "a ROS 2 bag")
 _FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rgbd_folder}
 
