@@ -16,7 +16,7 @@ def make_parser() -> argparse.ArgumentParser:
         epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las, "
         "e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
     )
-    parser.set_defaults(report=None)
+    parser.set_defaults(report=None, num_far=0)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(run: Any, **defaults: Any) -> argparse.ArgumentParser:

@@ -72,7 +72,7 @@ def sampling_of(arguments: argparse.Namespace) -> SamplingConfig:
 
 def far_hits(arguments: argparse.Namespace) -> str:
     """How many hits were lost to ``--max-range``, for the line that a verb ends with."""
-    count = getattr(arguments, "num_far", 0)
+    count = arguments.num_far
     limit = sampling_of(arguments).max_range
     return f"; {count} hits beyond the maximum range of {limit:g} m count as no-return" * (
         count > 0
@@ -85,7 +85,7 @@ def check_hits(arguments: argparse.Namespace, num_hits: int) -> None:
     Raises:
         ValueError: there is no hit, and some were lost to the maximum range.
     """
-    if num_hits == 0 and getattr(arguments, "num_far", 0):
+    if num_hits == 0 and arguments.num_far:
         raise ValueError(
             f"no hit lies within the maximum range of {sampling_of(arguments).max_range:g} m of its "
             f"sensor; {arguments.num_far} lie beyond. Is the sensor position right (lardhm info "
@@ -97,7 +97,7 @@ def _count_far(scans: Scans, arguments: argparse.Namespace) -> None:
     """Add up the hits beyond the maximum range, for verbs that sample."""
     if hasattr(arguments, "max_range"):
         far = scans.is_return & (scans.ranges > sampling_of(arguments).max_range)
-        arguments.num_far = getattr(arguments, "num_far", 0) + int(far.sum())
+        arguments.num_far += int(far.sum())
 
 
 def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
