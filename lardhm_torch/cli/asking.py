@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lardhm_torch.cli.scan_files import read_scans
+from lardhm_torch.cli.scan_files import describe_scans, read_scans
 
 # torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
 
@@ -124,13 +124,37 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def info(arguments: argparse.Namespace) -> None:
-    """What a map file, or the folder of a tiled map, holds."""
-    rows = (_info_of_folder if Path(arguments.map).is_dir() else _info_of_file)(arguments.map)
+    """What a map file, a tiled folder or scan files hold, and how scan files are read."""
+    if any(map(_is_scans, arguments.paths)):
+        _info_of_scans(arguments)
+        return
+    if len(arguments.paths) > 1:
+        raise ValueError(f"one map at a time can be described; got {len(arguments.paths)} paths")
+    (path,) = arguments.paths
+    rows = (_info_of_folder if Path(path).is_dir() else _info_of_file)(path)
     if arguments.json:
         print(json.dumps(rows, indent=2))
         return
     for name, value in rows.items():
         print(f"{name:<22}{value}")
+
+
+def _is_scans(name: str) -> bool:
+    """Whether a path names scans and not a map."""
+    from lardhm_torch.io.scan_files import SCAN_SUFFIXES
+    from lardhm_torch.tiles.manifest import MANIFEST_NAME
+
+    path = Path(name)
+    if path.is_dir():
+        return not (path / MANIFEST_NAME).is_file()
+    return path.suffix.lower() in SCAN_SUFFIXES
+
+
+def _info_of_scans(arguments: argparse.Namespace) -> None:
+    """What readers find in scan files and what they assume, in one line."""
+    arguments.scans = arguments.paths
+    report = describe_scans(arguments)
+    print(json.dumps(report.as_dict(), indent=2) if arguments.json else report)
 
 
 def _info_of_file(path: str) -> dict[str, Any]:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lardhm_torch.cli.scan_files import iter_scans_of, read_scans, report_dropped
+from lardhm_torch.cli.scan_files import (
+    check_hits,
+    far_hits,
+    iter_scans_of,
+    read_scans,
+    report_dropped,
+    sampling_of,
+)
 from lardhm_torch.cli.tiling import update_folder
 
 # torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
@@ -43,7 +50,10 @@ def fit(arguments: argparse.Namespace) -> None:
             "--resume, --view and --radius belong to --incremental, which is not given"
         )
     scans = read_scans(arguments)
-    samples = sample_rays(scans, seed=arguments.seed)
+    sampling = sampling_of(arguments)
+    samples = sample_rays(scans, sampling, seed=arguments.seed)
+    hits = int(samples.labels.sum())
+    check_hits(arguments, hits)
     report_dropped(samples.dropped)
     settings = {} if arguments.neighbors is None else {"num_neighbors": arguments.neighbors}
     model = LardHilbertMap(scans.dim, **settings)
@@ -56,17 +66,16 @@ def fit(arguments: argparse.Namespace) -> None:
             model,
             samples.points,
             samples.labels,
-            resample=lambda epoch: sample_rays(scans, seed=arguments.seed + epoch),
+            resample=lambda epoch: sample_rays(scans, sampling, seed=arguments.seed + epoch),
             seed=arguments.seed,
             state=load_state(path) if path and Path(path).exists() else None,
             after_epoch=(lambda state: save_state(state, path)) if path else None,
             progress=True,
         )
     model.save(arguments.output)
-    hits = int(samples.labels.sum())
     print(
         f"{hits} hits and {len(samples) - hits} free points -> {len(model)} clusters "
-        f"-> {arguments.output}"
+        f"-> {arguments.output}{far_hits(arguments)}"
     )
 
 
@@ -82,6 +91,7 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         num_clusters=arguments.clusters,
         radius=arguments.radius,
         checkpoint_every=arguments.checkpoint_every,
+        sampling=sampling_of(arguments),
         seed=arguments.seed,
     )
     scans = iter_scans_of(arguments)
@@ -105,7 +115,10 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
     finally:
         if live:
             live.close()
-    print(f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}")
+    print(
+        f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}"
+        f"{far_hits(arguments)}"
+    )
 
 
 def update(arguments: argparse.Namespace) -> None:
@@ -119,12 +132,15 @@ def update(arguments: argparse.Namespace) -> None:
 
     model = LardHilbertMap.load(arguments.map)
     config = StreamConfig(
-        num_clusters=arguments.clusters, radius=arguments.radius, seed=arguments.seed
+        num_clusters=arguments.clusters,
+        radius=arguments.radius,
+        seed=arguments.seed,
+        sampling=sampling_of(arguments),
     )
     before = len(model)
     seen = stream_scans(model, iter_scans_of(arguments, model.dim), config, progress=True)
     model.save(arguments.output)
     print(
         f"{seen.scans} scans, {seen.rays} rays -> {before} clusters became {len(model)} "
-        f"-> {arguments.output}"
+        f"-> {arguments.output}{far_hits(arguments)}"
     )

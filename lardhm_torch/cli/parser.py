@@ -16,6 +16,7 @@ def make_parser() -> argparse.ArgumentParser:
         epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las, "
         "e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
     )
+    parser.set_defaults(report=None, num_far=0)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(run: Any, **defaults: Any) -> argparse.ArgumentParser:
@@ -63,6 +64,7 @@ def _scan_verbs(verb: Any) -> None:
         "--checkpoint-every", type=int, default=1, metavar="N", help="scans between two (1)"
     )
     _radius(sub)
+    _ranges(sub)
     sub.add_argument("--dim", type=int, help="2 drops a constant last column")
     _seed(sub)
 
@@ -74,6 +76,7 @@ def _map_verbs(verb: Any) -> None:
     sub.add_argument("-o", "--output", metavar="FILE", help="needed unless MAP is a tiled folder")
     sub.add_argument("--clusters", type=int, help="of a scan in an unknown place (from the data)")
     _radius(sub)
+    _ranges(sub)
     _seed(sub)
 
     sub = verb(asking.query)
@@ -120,7 +123,8 @@ def _map_verbs(verb: Any) -> None:
     _seed(sub)
 
     sub = verb(asking.info)
-    sub.add_argument("map")
+    sub.add_argument("paths", nargs="+", metavar="PATH", help="a map, or SCANS")
+    _reading(sub)
     sub.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
 
@@ -128,6 +132,7 @@ def _tile_verbs(verb: Any) -> None:
     sub = verb(tiling.tile)
     _scans(sub)
     sub.add_argument("-o", "--output", required=True, metavar="FOLDER")
+    _ranges(sub)
     sub.add_argument("--edge", type=float, default=20.0, help="of a tile [m] (20)")
     sub.add_argument("--halo", type=float, help="around a tile, trained with it [m] (0.5)")
     sub.add_argument("--neighbors", type=int, help="clusters that answer for a point")
@@ -145,26 +150,78 @@ def _tile_verbs(verb: Any) -> None:
 
 def _scans(sub: argparse.ArgumentParser, nargs: str = "+") -> None:
     sub.add_argument("scans", nargs=nargs, metavar="SCANS")
+    _reading(sub)
     sub.add_argument(
-        "--origin",
-        type=_numbers,
-        metavar="X,Y,Z",
-        help="sensor position of files that do not tell it",
+        "--every", type=_count, default=1, metavar="N", help="read every Nth scan (default: 1)"
     )
     sub.add_argument(
+        "--voxel",
+        type=_length,
+        metavar="METERS",
+        help="keep one ray of a scan per voxel of this size (default: all rays)",
+    )
+
+
+def _reading(sub: argparse.ArgumentParser) -> None:
+    """How scan files are read."""
+    add = sub.add_argument
+    add("--origin", type=_numbers, metavar="X,Y,Z", help="sensor position of files without one")
+    add(
         "--frame",
         choices=("sensor", "world"),
-        help="of points beside a pose file: moved by the poses, or only seen from there",
+        help="frame of the points: sensor (poses move them) or world (poses only give origins)",
+    )
+    add(
+        "--poses-frame",
+        choices=("camera", "lidar"),
+        help="whose poses a KITTI pose file holds (default: camera if calib.txt has Tr)",
+    )
+    add("--topic", action="append", default=[], help="topic of a bag's clouds or poses")
+    add("--camera", type=_numbers, metavar="FX,FY,CX,CY", help="intrinsics of depth images")
+    add(
+        "--pixel-step",
+        type=int,
+        default=4,
+        help="read every Nth row and column of depth images (default: 4)",
+    )
+    add(
+        "--depth-scale",
+        type=_length,
+        metavar="N",
+        help="depth image units per meter (default: 1000 for 7-Scenes, 5000 for TUM)",
+    )
+    add("--strict", action="store_true", help="fail where something would have to be guessed")
+
+
+def _ranges(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--min-range",
+        type=float,
+        metavar="METERS",
+        help="drop shorter rays: they end in the sensor's own body (default: 0.3)",
     )
     sub.add_argument(
-        "--topic", action="append", default=[], help="of a bag's clouds or poses, if there are more"
+        "--max-range",
+        type=float,
+        metavar="METERS",
+        help="longer rays are truncated and count as no-return (default: 100)",
     )
-    sub.add_argument(
-        "--camera", type=_numbers, metavar="FX,FY,CX,CY", help="of depth images without intrinsics"
-    )
-    sub.add_argument(
-        "--pixel-step", type=int, default=4, help="of depth images, rows and columns read (4)"
-    )
+
+
+def _count(text: str) -> int:
+    """A whole number from 1."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be 1 or more; got {text}")
+    return number
+
+
+def _length(text: str) -> float:
+    """A number above 0."""
+    number = float(text)
+    if not 0 < number < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be > 0 and finite; got {text}")
+    return number
 
 
 def _numbers(text: str) -> tuple[float, ...]:

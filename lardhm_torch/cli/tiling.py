@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from lardhm_torch.cli.scan_files import iter_pieces_of
+from lardhm_torch.cli.scan_files import far_hits, iter_pieces_of, sampling_of
 
 # torch and the rooms are imported inside the verbs: `lardhm --help` must be instant.
 
@@ -20,12 +20,13 @@ def tile(arguments: argparse.Namespace) -> None:
         halo=arguments.halo,
         seed=arguments.seed,
         num_neighbors=arguments.neighbors,
+        sampling=sampling_of(arguments),
     )
     ledger = tile_scans(iter_pieces_of(arguments), arguments.output, config, progress=True)
     points = sum(counts.core for counts in ledger.tiles.values())
     print(
         f"{ledger.rays} rays, {points} points -> {len(ledger.cores)} tiles -> {arguments.output}; "
-        f"next: lardhm fit-tiles {arguments.output}"
+        f"next: lardhm fit-tiles {arguments.output}{far_hits(arguments)}"
     )
 
 
@@ -47,6 +48,8 @@ def update_folder(arguments: argparse.Namespace) -> None:
 
     if arguments.output is not None and Path(arguments.output) != Path(arguments.map):
         raise ValueError(f"--output must be left out: {arguments.map} is updated in place")
+    if arguments.min_range is not None or arguments.max_range is not None:
+        raise ValueError("--min-range and --max-range of a tiled map are those of its tile run")
     if arguments.clusters is not None or arguments.radius is not None:
         raise ValueError("--clusters and --radius belong to map files, not to tiled maps")
     dim = read_manifest(arguments.map).dim

@@ -8,20 +8,28 @@ from pathlib import Path
 import numpy as np
 
 from lardhm_torch.io.notes import Note
-from lardhm_torch.io.poses import FoundPose, pose_beside
+from lardhm_torch.io.paths import POSE_FILES
+from lardhm_torch.io.poses import FoundPose, find_beside, pose_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.trajectories import move_points
 
-_WITHOUT_FRAME = (".ply", ".pcd", ".xyz", ".txt", ".csv", ".las", ".laz")
+_WITHOUT_FRAME = (".ply", ".pcd", ".xyz", ".txt", ".csv", ".las", ".laz", ".pts")
+_LEAST_ROTATION = 1e-6
 
 
-def placed(readout: Readout, file: Path, frame: str, poses_frame: str | None = None) -> Readout:
+def placed(
+    readout: Readout, file: Path, frame: str | None, poses_frame: str | None = None
+) -> Readout:
     """Points and origin by the file's pose: that of a pose file, or, in the sensor's frame, its own.
+
+    Without a frame points are left where they are, unless the file's own pose rotates.
 
     Raises:
         ValueError: the format says its frame itself, or there is no pose for points of the sensor
             frame.
     """
+    if frame is None:
+        return _as_written(readout, file)
     if file.suffix.lower() not in _WITHOUT_FRAME:
         raise ValueError(
             f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats say it themselves'
@@ -39,6 +47,27 @@ def placed(readout: Readout, file: Path, frame: str, poses_frame: str | None = N
             f"(or VIEWPOINT in PCD); got none for points of {readout.dim} coordinates"
         )
     return moved(readout, pose)
+
+
+def _as_written(readout: Readout, file: Path) -> Readout:
+    """Points that nobody says the frame of: the world's, unless the file's pose says otherwise."""
+    pose = readout.world_from_sensor
+    if pose is None:
+        return readout
+    if np.abs(pose[:3, :3] - np.eye(3)).max() > _LEAST_ROTATION:
+        raise ValueError(
+            "its pose (VIEWPOINT) rotates: the points may still be in the sensor frame. Say it: "
+            'frame="sensor" moves them by the pose, frame="world" leaves them and takes the '
+            "position alone; --frame on the command line"
+        )
+    beside = find_beside(file, POSE_FILES)
+    unused = "" if beside is None else f", and {beside.name} beside it is not used"
+    return readout.noting(
+        Note(
+            f"points taken to be in the world frame already{unused}",
+            cure='frame="world" confirms it, frame="sensor" moves them by the pose; --frame',
+        )
+    )
 
 
 def moved(readout: Readout, pose: FoundPose) -> Readout:

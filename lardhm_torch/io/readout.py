@@ -47,6 +47,14 @@ class Readout:
         """The same with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
+    def select(self, rays: NDArray) -> Readout:
+        """The given rays (mask or indices), with all origins kept."""
+        columns = ("ends", "scan_id", "is_return", "target_index", "times")
+        values = {name: getattr(self, name) for name in columns}
+        return replace(
+            self, **{name: value[rays] for name, value in values.items() if value is not None}
+        )
+
     @property
     def dim(self) -> int:
         """Number of coordinates D."""
@@ -67,6 +75,22 @@ class Readout:
         if self.scan_id is None or not len(self.scan_id):
             return 1
         return int(self.scan_id.max()) + 1
+
+
+def without_zeros(readout: Readout) -> Readout:
+    """The readout without points at exactly zero, in the coordinates of the file.
+
+    Many writers put (0, 0, 0) where a beam met nothing or a point was invalid. As hits they would
+    be phantoms; where the sensor is at zero itself, rays without length.
+    """
+    is_zero = readout.ends[:, 0] == 0
+    if is_zero.any():
+        is_zero &= (readout.ends == 0).all(axis=1)
+    count = int(is_zero.sum())
+    if not count:
+        return readout
+    note = Note("points at exactly zero are left out (no measurement)", count, is_loss=True)
+    return readout.select(~is_zero).noting(note)
 
 
 def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
@@ -92,6 +116,7 @@ def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
         )
     origins, scan_id = _scans_of_rows(columns, origin_names)
     target = columns.get("target_index", columns.get("return_number"))
+    notes = (Note("sensor positions from columns ox oy oz"),) if origin_names else ()
     is_return = columns.get("is_return")
     return Readout(
         ends,
@@ -99,6 +124,7 @@ def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
         scan_id,
         None if is_return is None else whole_numbers(is_return, "is_return", 0, 1).astype(bool),
         None if target is None else whole_numbers(target, "target_index", 1, 2**31),
+        notes=notes,
     )
 
 

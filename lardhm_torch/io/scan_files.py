@@ -40,13 +40,15 @@ from lardhm_torch.io.e57 import read_e57
 from lardhm_torch.io.frames import placed
 from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import las_pieces, read_las
+from lardhm_torch.io.moving_sensor import seen_from_track
 from lardhm_torch.io.notes import Note, ScanReport, check_notes
 from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
 from lardhm_torch.io.origins import scans_from, unused_origin, with_origins
 from lardhm_torch.io.paths import expand_paths
 from lardhm_torch.io.pcd import read_pcd
 from lardhm_torch.io.ply import ply_pieces, read_ply
-from lardhm_torch.io.readout import Readout
+from lardhm_torch.io.ptx import read_ptx
+from lardhm_torch.io.readout import Readout, without_zeros
 from lardhm_torch.io.rgbd import Camera, is_rgbd_folder, read_rgbd
 from lardhm_torch.io.text import read_text
 from lardhm_torch.scans import Scans, concatenate_scans
@@ -61,6 +63,8 @@ _READERS: dict[str, Callable[[Path], Readout]] = {
     ".xyz": read_text,
     ".txt": read_text,
     ".csv": read_text,
+    ".pts": read_text,
+    ".ptx": read_ptx,
     ".bin": read_kitti,
     ".las": read_las,
     ".laz": read_las,
@@ -69,6 +73,7 @@ _READERS: dict[str, Callable[[Path], Readout]] = {
     ".db3": read_bag,
     ".mcap": read_bag,
 }
+_MAY_HOLD_ZEROS = (".ply", ".pcd", ".xyz", ".txt", ".csv", ".pts", ".las", ".laz")
 _PIECE_READERS: dict[str, Callable[[Path, int], Iterator[Readout]]] = {
     ".npz": npz_pieces,
     ".ply": ply_pieces,
@@ -76,6 +81,7 @@ _PIECE_READERS: dict[str, Callable[[Path, int], Iterator[Readout]]] = {
     ".laz": las_pieces,
 }
 _POINT_READERS = {**_READERS, ".npz": read_npz_points, ".npy": read_npy}
+SCAN_SUFFIXES = frozenset(_READERS)
 _BAGS = (".bag", ".db3", ".mcap", "a ROS 2 bag")
 _FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rgbd_folder}
 
@@ -168,8 +174,8 @@ def load_scans(
             for file, readout in zip(files, readouts, strict=True)
         ]
     )
-    if not scans.num_scans:
-        raise _no_scan_left(files, [note for readout in readouts for note in readout.notes])
+    if not len(scans):
+        raise _no_ray_left(files, [note for readout in readouts for note in readout.notes])
     return scans
 
 
@@ -318,9 +324,13 @@ def _read(file: Path, choice: _Choice) -> Readout:
 
 
 def _placed(readout: Readout, file: Path, choice: _Choice) -> Readout:
-    """Points in the world frame, as far as the caller says where they are."""
-    if choice.frame is None:
-        return readout
+    """Points in the world frame, as far as it is known which frame they are in."""
+    if file.suffix.lower() in _MAY_HOLD_ZEROS:
+        readout = without_zeros(readout)
+    if choice.origin is None and choice.frame != "sensor":
+        tracked = seen_from_track(readout, file)
+        if tracked is not None:
+            return tracked
     return placed(readout, file, choice.frame, choice.poses_frame)
 
 
@@ -345,9 +355,9 @@ def _num_placeholders(readout: Readout) -> int:
     return readout.num_scans if readout.origin_is_placeholder else 0
 
 
-def _no_scan_left(files: Sequence[Path], notes: Sequence[Note]) -> ValueError:
+def _no_ray_left(files: Sequence[Path], notes: Sequence[Note]) -> ValueError:
     said = "; ".join(sorted({str(note) for note in notes}))
-    return ValueError(f"{files[0]}: at least one scan with a pose is needed; got none: {said}")
+    return ValueError(f"{files[0]}: at least one point is needed; got none: {said}")
 
 
 @contextmanager
