@@ -88,10 +88,9 @@ def seen_from_track(readout: Readout, file: Path) -> Readout | None:
         notes.append(Note(text, int((~is_covered).sum()), is_loss=True))
         readout, times = readout.select(is_covered), times[is_covered]
     origins, scan_id = _origins(track, times)
-    _check_coordinates(readout, origins, source)
-    return replace(
-        readout, origins=origins, scan_id=scan_id, origin_is_placeholder=False
-    ).noting(*notes)
+    _check_coordinates(readout.ends, origins[scan_id], source)
+    seen = replace(readout, origins=origins, scan_id=scan_id, origin_is_placeholder=False)
+    return seen.noting(*notes)
 
 
 @lru_cache(maxsize=2)
@@ -136,13 +135,14 @@ def _origins(
     return np.stack(axes, axis=1), scan_id.reshape(-1).astype(np.int64)
 
 
-def _check_coordinates(readout: Readout, origins: NDArray[np.float64], source: Path) -> None:
+def _check_coordinates(
+    ends: NDArray[np.float64], starts: NDArray[np.float64], source: Path
+) -> None:
     """Raise a ValueError if sensor and points cannot be in the same coordinates."""
-    assert readout.scan_id is not None
-    some = slice(None, None, 1 + len(readout.ends) // 1000)
-    ranges = np.linalg.norm(readout.ends[some] - origins[readout.scan_id[some]], axis=1)
-    if np.median(ranges) > _FARTHEST:
+    some = slice(None, None, 1 + len(ends) // 1000)
+    distance = float(np.median(np.linalg.norm(ends[some] - starts[some], axis=1)))
+    if distance > _FARTHEST:
         raise ValueError(
             f"{source} must be in the coordinates of the points; the sensor would be "
-            f"{np.median(ranges) / 1000:.0f} km from them"
+            f"{distance / 1000:.0f} km from them"
         )
