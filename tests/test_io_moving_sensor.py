@@ -8,6 +8,7 @@ import torch
 from healthy_files import write_tum
 from scan_files import UTM, needs_laspy
 
+from lardhm_torch.io import scan_files
 from lardhm_torch.io.notes import ScanFileWarning, ScanReport
 from lardhm_torch.io.scan_files import iter_pieces, iter_scans, load_scans
 from lardhm_torch.simulation import true_ranges
@@ -51,9 +52,7 @@ def write_mobile_las(path: Path, clock: str = "adjusted", point_format: int = 6)
     las = laspy.create(file_version="1.4", point_format=point_format)
     las.header.scales, las.header.offsets = [1e-3] * 3, UTM
     las.header.global_encoding.gps_time_type = (
-        laspy.header.GpsTimeType.WEEK_TIME
-        if clock == "week"
-        else laspy.header.GpsTimeType.STANDARD
+        laspy.header.GpsTimeType.WEEK_TIME if clock == "week" else laspy.header.GpsTimeType.STANDARD
     )
     las.x, las.y, las.z = points.T
     las.gps_time = times + CLOCKS[clock]
@@ -151,10 +150,14 @@ def test_a_trajectory_of_another_day_or_of_other_coordinates_is_an_error(tmp_pat
     write_track(tmp_path / "trajectory.txt")
     rows = np.loadtxt(tmp_path / "trajectory.txt")
     np.savetxt(tmp_path / "trajectory.txt", rows + [86_400, 0, 0, 0], fmt="%.9f")
-    with pytest.raises(ValueError, match=r"a\.las cannot.*trajectory\.txt must cover the GPS times"):
+    with pytest.raises(
+        ValueError, match=r"a\.las cannot.*trajectory\.txt must cover the GPS times"
+    ):
         load_scans(tmp_path / "a.las")
     np.savetxt(tmp_path / "trajectory.txt", rows * [1, 1e-4, 1e-5, 1], fmt="%.9f")  # degrees
-    with pytest.raises(ValueError, match=r"trajectory\.txt must be in the coordinates of the points"):
+    with pytest.raises(
+        ValueError, match=r"trajectory\.txt must be in the coordinates of the points"
+    ):
         load_scans(tmp_path / "a.las")
     (tmp_path / "trajectory.txt").write_text("nan nan nan nan\n")
     with pytest.raises(ValueError, match=r"must hold lines of time x y z; none is finite"):
@@ -175,7 +178,7 @@ def test_the_caller_and_pose_files_of_other_times_go_before_a_trajectory(tmp_pat
         load_scans(tmp_path / "a.las")
 
 
-def test_pieces_and_single_scans_hold_the_same_rays(tmp_path):
+def test_pieces_and_packets_hold_the_same_rays(tmp_path, monkeypatch):
     times, points = write_mobile_las(tmp_path / "a.laz")
     write_track(tmp_path / "trajectory.txt")
     whole = load_scans(tmp_path / "a.laz")
@@ -184,6 +187,11 @@ def test_pieces_and_single_scans_hold_the_same_rays(tmp_path):
     assert torch.equal(torch.cat([piece.ends for piece in pieces]), whole.ends)
     starts = torch.cat([piece.ray_origins for piece in pieces])
     torch.testing.assert_close(starts, whole.ray_origins, rtol=0, atol=2e-3)
-    scans = list(iter_scans(tmp_path / "a.laz"))
-    assert len(scans) == whole.num_scans > 300
-    assert sum(map(len, scans)) == len(whole)
+    monkeypatch.setattr(scan_files, "PACKET_RAYS", 150)
+    packets = list(iter_scans(tmp_path / "a.laz"))
+    assert [len(packet) for packet in packets] == [150, 150, 100]
+    order = whole.scan_id.argsort(stable=True)
+    assert (np.diff(times[order]) > -1e-3).all()  # a millimeter takes less than that
+    assert torch.equal(torch.cat([packet.ends for packet in packets]), whole.ends[order])
+    starts = torch.cat([packet.ray_origins for packet in packets])
+    assert torch.equal(starts, whole.ray_origins[order])

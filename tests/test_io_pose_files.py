@@ -219,7 +219,9 @@ def test_line_numbers_where_stamps_have_a_gap_are_a_guess(tmp_path):
     poses = np.concatenate([DRIVE.poses, DRIVE.poses])
     write_tum(tmp_path / "poses.txt", [0.0, 0.1, 0.5, 0.6, 0.7, 0.8], poses)
     assert_rays(load_scans(tmp_path), DRIVE)
-    with pytest.raises(ValueError, match=r"refuses a guess: poses by line number .* stamps have a gap"):
+    with pytest.raises(
+        ValueError, match=r"refuses a guess: poses by line number .* stamps have a gap"
+    ):
         load_scans(tmp_path, strict=True)
 
 

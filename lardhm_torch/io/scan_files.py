@@ -55,6 +55,7 @@ from lardhm_torch.scans import Scans, concatenate_scans
 
 PathLike = str | os.PathLike[str]
 PIECE_RAYS = 1 << 18  # rays of a piece; their samples take about 100 MB
+PACKET_RAYS = 1 << 15  # rays of a moving sensor that are given together as one scan
 
 _READERS: dict[str, Callable[[Path], Readout]] = {
     ".npz": read_npz,
@@ -194,18 +195,24 @@ def iter_scans(
     """The scans of `load_scans` one by one, each with its own origin alone.
 
     A file is read when its turn comes, so that a folder of any length needs the memory of one file.
+    The rays of a moving sensor (LAS with a trajectory by GPS time), each with an origin of its own,
+    come in packets of 32,768 in the order of time.
 
     Args and errors: as `load_scans`; an error comes when the file's turn comes, and that no file
     needs the origin given comes at the end, unless there is one file only.
     """
     choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
-    for scans in _scans_of_each_file(path, choice, report, max_rays=None):
+    for scans, moves in _scans_of_each_file(path, choice, report, max_rays=None):
         order = scans.scan_id.argsort(stable=True)
         counts = scans.scan_id.bincount(minlength=scans.num_scans).tolist()
-        for number, rays in enumerate(order.split(counts)):
+        for number, rays in enumerate(order.split(PACKET_RAYS if moves else counts)):
             scan = scans.select(rays)
-            origins, of_all = scans.origins[number : number + 1], torch.zeros_like(scan.scan_id)
-            yield Scans(origins, scan.ends, of_all, scan.is_return, scan.target_index)
+            if moves:
+                used, scan_id = scan.scan_id.unique(return_inverse=True)
+            else:
+                used, scan_id = torch.tensor([number]), torch.zeros_like(scan.scan_id)
+            origins = scans.origins[used]
+            yield Scans(origins, scan.ends, scan_id, scan.is_return, scan.target_index)
 
 
 def iter_pieces(
@@ -229,7 +236,7 @@ def iter_pieces(
     Args and errors: as `iter_scans`; an error comes when the piece's turn comes.
     """
     choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
-    for scans in _scans_of_each_file(path, choice, report, max_rays):
+    for scans, _ in _scans_of_each_file(path, choice, report, max_rays):
         for start in range(0, len(scans), max_rays):
             yield scans.select(torch.arange(start, min(len(scans), start + max_rays)))
 
@@ -239,8 +246,11 @@ def _scans_of_each_file(
     choice: _Choice,
     report: ScanReport | None,
     max_rays: int | None,
-) -> Iterator[Scans]:
-    """The scans of one file after the other; of some formats in pieces of max_rays."""
+) -> Iterator[tuple[Scans, bool]]:
+    """The scans of one file after the other, and whether each of their rays has its own origin.
+
+    Some formats come in pieces of max_rays.
+    """
     files = expand_paths(path, _READERS, _kind_of_folder)
     origin_is_used, placeholders = choice.origin is None, 0
     for number, file in enumerate(files):
@@ -254,7 +264,8 @@ def _scans_of_each_file(
             if placeholders == 1 and number + 1 < len(files) and choice.origin is None:
                 # The first scan of a drive may stand at zero; if the next does, too, none does.
                 placeholders += _num_placeholders(_read(files[number + 1], choice))
-            yield _finished(readout, file, choice, placeholders, report)
+            scans = _finished(readout, file, choice, placeholders, report)
+            yield scans, readout.times is not None and scans.num_scans > 1
     if not origin_is_used:
         raise unused_origin(choice.origin or (), files)
 
