@@ -118,7 +118,7 @@ def test_lines_of_tum_serve_as_a_trajectory(tmp_path):
 
 
 def test_a_trajectory_of_one_position_a_second_is_no_gap(tmp_path):
-    times, points = write_mobile_las(tmp_path / "a.las")
+    times, _ = write_mobile_las(tmp_path / "a.las")
     write_track(tmp_path / "trajectory.txt", step=1.0)
     is_covered = times <= 2.9
     with pytest.warns(ScanFileWarning, match=r"points left out: trajectory\.txt does not cover"):
@@ -149,7 +149,7 @@ def test_a_trajectory_of_another_day_or_of_other_coordinates_is_an_error(tmp_pat
     write_mobile_las(tmp_path / "a.las")
     write_track(tmp_path / "trajectory.txt")
     rows = np.loadtxt(tmp_path / "trajectory.txt")
-    np.savetxt(tmp_path / "trajectory.txt", rows + [86_400, 0, 0, 0], fmt="%.9f")
+    np.savetxt(tmp_path / "trajectory.txt", rows + np.array([86_400, 0, 0, 0]), fmt="%.9f")
     with pytest.raises(
         ValueError, match=r"a\.las cannot.*trajectory\.txt must cover the GPS times"
     ):
@@ -165,7 +165,7 @@ def test_a_trajectory_of_another_day_or_of_other_coordinates_is_an_error(tmp_pat
 
 
 def test_the_caller_and_pose_files_of_other_times_go_before_a_trajectory(tmp_path):
-    _, points = write_mobile_las(tmp_path / "a.las")
+    write_mobile_las(tmp_path / "a.las")
     write_track(tmp_path / "trajectory.txt")
     scans = load_scans(tmp_path / "a.las", origin=tuple(UTM))
     assert scans.origins.tolist() == [UTM.tolist()]
@@ -179,7 +179,7 @@ def test_the_caller_and_pose_files_of_other_times_go_before_a_trajectory(tmp_pat
 
 
 def test_pieces_and_packets_hold_the_same_rays(tmp_path, monkeypatch):
-    times, points = write_mobile_las(tmp_path / "a.laz")
+    times, _ = write_mobile_las(tmp_path / "a.laz")
     write_track(tmp_path / "trajectory.txt")
     whole = load_scans(tmp_path / "a.laz")
     pieces = list(iter_pieces(tmp_path / "a.laz", max_rays=150))
