@@ -79,8 +79,9 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
         raise ValueError(
             f'poses_frame must be "camera" or "lidar" beside {source}; got {poses_frame!r}'
         )
-    files = [path.parent, source, *_calibrations(source, path)]
-    stamps = tuple((str(file), file.stat().st_mtime_ns) for file in files)
+    folders = tuple(_changed(f) for f in {path.parent, path.parent.parent, source.parent.parent})
+    files = (source, *_calibrations(path.parent, source, folders))
+    stamps = (*folders, *map(_changed, files))
     matched = _pose_of_each(path.parent, path.suffix.lower(), source, poses_frame, stamps)
     pose, notes = matched.poses[path.name], matched.notes
     if path.name != next(iter(matched.poses)):  # warnings are for the whole folder: once is enough
@@ -91,9 +92,17 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
     return FoundPose(None, (lost, *notes))
 
 
-def _calibrations(*files: Path) -> list[Path]:
-    found = [find_calibration(name, *files) for name in CALIBRATION_FILES]
-    return [file for file in found if file is not None]
+def _changed(path: Path) -> tuple[str, int]:
+    """Changes when the file or folder does."""
+    return str(path), path.stat().st_mtime_ns
+
+
+@lru_cache(maxsize=4)
+def _calibrations(
+    folder: Path, source: Path, stamps: tuple[tuple[str, int], ...]
+) -> tuple[Path, ...]:
+    found = [find_calibration(name, source, folder / "scan") for name in CALIBRATION_FILES]
+    return tuple(file for file in found if file is not None)
 
 
 @lru_cache(maxsize=4)

@@ -53,7 +53,6 @@ def read_cloud(message: Message, decode: Any) -> Cloud:
         ValueError: the message promises more than it holds.
     """
     seconds = 1e-9 * message.recorded
-    is_return = None
     if message.kind.endswith("/CustomMsg"):
         stamp, frame, points = _livox_points(message)
         stamp = stamp or seconds
@@ -64,10 +63,11 @@ def read_cloud(message: Message, decode: Any) -> Cloud:
             points, is_return, num_invalid = laser_points(content)
             return Cloud(stamp, message.recorded, frame, points, is_return, num_invalid)
         points = cloud_points(content)
-    is_zero = ~points.any(axis=1)
+    is_zero = points[:, 0] == 0
     if is_zero.any():
+        is_zero &= ~points.any(axis=1)
         points = points[~is_zero]
-    return Cloud(stamp, message.recorded, frame, points, is_return, int(is_zero.sum()))
+    return Cloud(stamp, message.recorded, frame, points, None, int(is_zero.sum()))
 
 
 def laser_points(
