@@ -147,7 +147,7 @@ def _scan_of(columns: dict[str, NDArray[np.float64]]) -> Readout:
     ranges = np.linalg.norm(points, axis=1)
     is_zero = ranges == 0
     is_hit, is_beam = (state == 0) & ~is_zero, (state == 1) & (ranges > 0)
-    longest = np.nanmax(ranges[is_hit], initial=0.0)
+    longest = float(np.nanmax(ranges[is_hit], initial=0.0))
     is_beam &= longest > 0
     points[is_beam] *= (longest / ranges[is_beam])[:, None]
     target = columns.get("returnIndex", np.zeros(len(points)))

@@ -15,6 +15,7 @@ from lardhm_torch.io.readout import Readout, without_zeros
 _LAYOUTS = [("<f4", 4), ("<f4", 3), ("<f4", 5), ("<f4", 6), ("<f8", 3), ("<f8", 4)]
 _PROBED_BYTES = 480 * 2000  # a whole number of points in every layout
 _CLEARLY = 0.3  # in mean log variance: what another layout must be better by
+_WILD_EXPONENTS = 2.0  # standard deviation of the powers of ten of coordinates
 _LEAST_POINTS = 50  # fewer tell nothing about the layout
 
 
@@ -71,9 +72,16 @@ def _layout(content: NDArray[np.uint8], is_nuscenes: bool) -> tuple[str, int]:
 
 
 def _mean_log_variance(content: NDArray[np.uint8], kind: str, columns: int) -> float:
-    """How much the columns vary under a layout; infinite where its numbers make no sense."""
+    """How much the columns vary under a layout; infinite where its numbers make no sense.
+
+    Read with the wrong size, floats have wild exponents: coordinates span few powers of ten.
+    """
     values = content.view(kind).reshape(-1, columns).astype(np.float64)
     usable = values[np.isfinite(values).all(axis=1)]
-    if len(usable) < 0.5 * len(values) or not len(usable) or np.abs(usable[:, :3]).max() > 1e7:
+    if not len(usable) or len(usable) < 0.5 * len(values):
+        return np.inf
+    sizes = np.abs(usable[:, :3])
+    exponents = np.log10(sizes[sizes > 0])
+    if len(exponents) and exponents.std() > _WILD_EXPONENTS:
         return np.inf
     return float(np.log(usable.var(axis=0) + 1e-6).mean())

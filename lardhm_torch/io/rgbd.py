@@ -178,7 +178,9 @@ def _depth_entry(words: list[str], name: str) -> tuple[float, str]:
     pairs = list(zip(words[::2], words[1::2], strict=False))
     are_pairs = len(words) in (2, 4) and all(_is_stamp(s) and _is_inside(f) for s, f in pairs)
     if not are_pairs:
-        raise ValueError(f"{name} must have a stamp and a file in each line; got {' '.join(words)}")
+        raise ValueError(
+            f"{name} must have a stamp and a file in each line; got {' '.join(words)!r}"
+        )
     named = [pair for pair in pairs if "depth" in pair[1].lower()]
     stamp, image = named[0] if len(named) == 1 else pairs[0]
     return float(stamp), image
@@ -221,7 +223,7 @@ def _read_intrinsics(folder: Path) -> tuple[float, float, float, float]:
 def _check_intrinsics(values: tuple[Any, ...], name: str) -> tuple[float, float, float, float]:
     if len(values) != 4 or not all(map(math.isfinite, values)) or not (values[0] > 0 and values[1]):
         raise ValueError(
-            f"{name} must give fx > 0, fy other than 0 and cx, cy [pixels]; got {values}"
+            f"{name} must give fx, fy > 0 and cx, cy [pixels], or fy < 0 where y points up; got {values}"
         )
     fx, fy, cx, cy = values
     return fx, fy, cx, cy

@@ -309,6 +309,8 @@ def save_scans(scans: Scans, path: PathLike) -> None:
 def load_points(path: PathLike) -> Tensor:
     """(N, D) float64 points of one file [m]: ``.npy``, ``.npz`` with ``points``, or a scan file.
 
+    Of a scan file the hits: beams without return have no point.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file cannot be read, or holds no (N, D) array of numbers.
@@ -319,7 +321,9 @@ def load_points(path: PathLike) -> Tensor:
         raise ValueError(f"path must be one file of points; {file} is a folder")
     (file,) = expand_paths(file, _POINT_READERS)
     with _naming(file):
-        return torch.from_numpy(_POINT_READERS[file.suffix.lower()](file).ends)
+        readout = _POINT_READERS[file.suffix.lower()](file)
+    hits = readout if readout.is_return is None else readout.select(readout.is_return)
+    return torch.from_numpy(hits.ends)
 
 
 def _kind_of_folder(folder: Path) -> str | None:

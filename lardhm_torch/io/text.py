@@ -120,9 +120,9 @@ def _read_counted(path: Path, layout: _Layout, wanted: dict[str, int]) -> Readou
             count = int(line) if line else None
     table = np.concatenate(tables)
     readout = readout_from_columns({name: table[:, i] for i, name in enumerate(wanted)})
-    note = Note("tables of points with a count line", len(tables))
     if len(tables) == 1 or readout.scan_id is not None:
-        return readout.noting(note)
+        return readout
+    note = Note("tables of points, each taken for a scan", len(tables))
     scan_id = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
     return Readout(readout.ends, scan_id=scan_id, notes=(note,))
 
