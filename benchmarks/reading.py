@@ -27,10 +27,7 @@ sys.path.insert(0, str(ROOT / "scripts"))
 TIMED = """
 import json, sys, time, warnings
 warnings.simplefilter("ignore")
-try:
-    from lardhm_torch.io.scan_files import load_scans
-except ImportError:
-    from lardhm_torch.scan_files import load_scans
+from lardhm_torch import load_scans
 seconds = {}
 for path in sys.argv[1:]:
     options = {} if path.endswith((".ptx", ".npz")) else {"origin": (1.0, 2.0, 3.0)}
@@ -75,7 +72,9 @@ def write_files(folder: Path, count: int) -> list[Path]:
 def timed(checkout: Path, files: list[Path]) -> dict[str, float | None]:
     """Seconds to read each file with the code of a checkout, in a process of its own."""
     command = [sys.executable, "-c", TIMED, *map(str, files)]
-    run = subprocess.run(command, cwd=checkout, check=True, capture_output=True, text=True)
+    run = subprocess.run(command, cwd=checkout, check=False, capture_output=True, text=True)
+    if run.returncode:
+        raise RuntimeError(run.stderr[-2000:])
     return json.loads(run.stdout)
 
 
