@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import resource
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -82,8 +84,14 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
     elif extension in ("bag", "db3", "mcap"):
         maker = BagMaker(extension == "bag")
         messages = bag_messages(maker, [points[:100], points[100:]], POSES)
+        if variant in ("laser", "livox"):
+            rays = points if variant == "livox" else np.abs(points[:, 0])
+            messages = [messages[0], getattr(maker, variant)(rays, 100.0)]
+            variant = ""
         messages.append(maker.transform(POSES[1], 100.0, ("odom", "base")))
         maker.write(path, messages, variant)
+    elif extension in ("calib", "metadata", "wal", "track"):
+        return healthy_sidecar(extension, folder, points)
     elif extension in ("depth", "tum"):
         return healthy_images(extension, variant, folder, rng)
     elif extension == "map":
@@ -98,6 +106,31 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
         rows = np.hstack([points, np.ones_like(points)])
         np.savetxt(path, rows, delimiter=",", header="x,y,z,ox,oy,oz", comments="")
     return path, path
+
+
+def healthy_sidecar(name: str, folder: Path, points: np.ndarray) -> tuple[Path, Path]:
+    """A file beside a scan, and the scan that cannot be read without it."""
+    if name == "calib":
+        scan = write_kitti(folder, points)
+        (folder / "calib.txt").write_text("P0: 1 0 0 0\nTr: 0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3\n")
+        return folder / "calib.txt", scan
+    if name == "track":
+        write_las(folder / "scan.las", points, 6)
+        (folder / "trajectory.txt").write_text("# time x y z\n-0.1 1 2 3\n0.1 1 2 4\n")
+        return folder / "trajectory.txt", folder / "scan.las"
+    maker = BagMaker(is_ros1=False)
+    messages = bag_messages(maker, [points[:100], points[100:]], POSES)
+    if name == "metadata":
+        maker.write(folder / "bag.mcap", messages)  # its metadata.yaml is in the folder bag
+        (folder / "bag.mcap").rename(folder / "bag" / "bag.mcap")
+        return folder / "bag" / "metadata.yaml", folder / "bag"
+    scan = folder / "scan.db3"
+    database = sqlite3.connect(maker.write(folder / "live.db3", messages))
+    database.executescript("PRAGMA journal_mode=WAL; PRAGMA wal_autocheckpoint=0; VACUUM")
+    for ending in ("", "-wal"):
+        shutil.copy(folder / f"live.db3{ending}", folder / f"scan.db3{ending}")
+    database.close()
+    return scan.with_name("scan.db3-wal"), scan
 
 
 def healthy_images(
@@ -134,7 +167,10 @@ FORMATS = {  # and the library that reads or makes them
     **dict.fromkeys(("depth-png", "depth-pose", "depth-camera", "tum-list", "tum-poses"), "PIL"),
     "tum-pairs": "PIL",
     **dict.fromkeys(("bag", "bag-bz2", "bag-lz4", "db3", "db3-zstd-message"), "rosbags"),
-    **dict.fromkeys(("mcap", "mcap-zstd"), "rosbags"),
+    **dict.fromkeys(("mcap", "mcap-zstd", "mcap-laser", "mcap-livox", "bag-livox"), "rosbags"),
+    **dict.fromkeys(("wal", "metadata"), "rosbags"),
+    "calib": "",
+    "track": "lazrs",
     "e57": "pye57",
     "map-safetensors": "safetensors",
 }

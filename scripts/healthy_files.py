@@ -9,6 +9,25 @@ from typing import Any
 import numpy as np
 
 CLOUD_TOPIC, POSE_TOPIC, FRAME = "/points", "/odom", "lidar"
+LIVOX_TYPES = {  # https://github.com/Livox-SDK/livox_ros_driver2/tree/master/msg
+    "livox_ros_driver2/msg/CustomPoint": """
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+""",
+    "livox_ros_driver2/msg/CustomMsg": """
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+""",
+}
 
 
 def write_ply(path: Path, points: np.ndarray, encoding: str) -> None:
@@ -187,9 +206,12 @@ class BagMaker:
 
         self.is_ros1 = is_ros1
         self.store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        definitions = dict(LIVOX_TYPES)
         if is_ros1:
             transforms = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
+            definitions["tf2_msgs/msg/TFMessage"] = transforms
+        for kind, definition in definitions.items():
+            self.store.register(get_types_from_msg(definition, kind))
 
     def _make(self, kind: str, *values: Any) -> Any:
         return self.store.types[kind](*values)
@@ -214,6 +236,37 @@ class BagMaker:
         )  # fmt: skip
         return topic, "sensor_msgs/msg/PointCloud2", stamp, cloud
 
+    def laser(
+        self,
+        ranges: np.ndarray,
+        stamp: float,
+        angles: tuple[float, float] = (-np.pi, np.pi),
+        limits: tuple[float, float] = (0.1, 10.0),
+        topic: str = "/scan",
+    ):
+        """A LaserScan from the first to the last angle [rad], with range_min and range_max [m]."""
+        kind = "sensor_msgs/msg/LaserScan"
+        step = (angles[1] - angles[0]) / max(1, len(ranges) - 1)
+        values = np.asarray(ranges, dtype=np.float32)
+        nothing = np.empty(0, np.float32)
+        scan = self._make(
+            kind, self.header(stamp, FRAME), *angles, step, 0.0, 0.0, *limits, values, nothing
+        )
+        return topic, kind, stamp, scan
+
+    def livox(self, points: np.ndarray, stamp: float, topic: str = "/livox/lidar"):
+        """A CustomMsg of Livox's driver."""
+        kind, whole = "livox_ros_driver2/msg/CustomMsg", round(stamp * 1e9)
+        rows = [
+            self._make(
+                "livox_ros_driver2/msg/CustomPoint", 1000 * i, *map(float, row), 7, 16, i % 4
+            )
+            for i, row in enumerate(points)
+        ]
+        unused = np.zeros(3, np.uint8)
+        header = self.header(stamp, FRAME)
+        return topic, kind, stamp, self._make(kind, header, whole, len(rows), 1, unused, rows)
+
     def _parts(self, pose: np.ndarray, kind: str) -> Any:
         from scipy.spatial.transform import Rotation
 
@@ -236,15 +289,22 @@ class BagMaker:
             self._make(kind, self.header(stamp, frame), self._parts(pose, "Pose")),
         )
 
-    def odometry(self, pose: np.ndarray, stamp: float, child: str = FRAME, topic: str = POSE_TOPIC):
-        """An Odometry from the frame odom to child."""
+    def odometry(
+        self,
+        pose: np.ndarray,
+        stamp: float,
+        child: str = FRAME,
+        topic: str = POSE_TOPIC,
+        frame: str = "odom",
+    ):
+        """An Odometry from frame to child."""
         nothing = self._make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
         twist = self._make("geometry_msgs/msg/Twist", nothing, nothing)
         spread = np.zeros(36)
         kind = "nav_msgs/msg/Odometry"
         message = self._make(
             kind,
-            self.header(stamp, "odom"),
+            self.header(stamp, frame),
             child,
             self._make("geometry_msgs/msg/PoseWithCovariance", self._parts(pose, "Pose"), spread),
             self._make("geometry_msgs/msg/TwistWithCovariance", twist, spread),

@@ -173,9 +173,11 @@ def _reading(sub: argparse.ArgumentParser) -> None:
     )
     add(
         "--poses-frame",
-        choices=("camera", "lidar"),
-        help="whose poses a KITTI pose file holds (default: camera if calib.txt has Tr)",
+        metavar="FRAME",
+        help="whose poses a pose file holds: camera or lidar (default: camera beside calib.txt); "
+        "of a bag: the tf frame of the pose topic",
     )
+    add("--sensor-frame", metavar="FRAME", help="tf frame of the sensor, if clouds are in another")
     add("--topic", action="append", default=[], help="topic of a bag's clouds or poses")
     add("--camera", type=_numbers, metavar="FX,FY,CX,CY", help="intrinsics of depth images")
     add(

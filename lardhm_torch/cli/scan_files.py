@@ -111,6 +111,7 @@ def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
         "origin": arguments.origin,
         "frame": arguments.frame,
         "poses_frame": arguments.poses_frame,
+        "sensor_frame": arguments.sensor_frame,
         "topic": arguments.topic,
         "camera": Camera(
             intrinsics=arguments.camera,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import natural_key
-from lardhm_torch.io.poses import find_beside, read_poses
+from lardhm_torch.io.pose_files import read_trajectory
+from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.records import read_table
 from lardhm_torch.io.trajectories import MAX_STAMP_GAP, Trajectory, check_rigid, move_points
@@ -154,7 +155,7 @@ def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
             stamps.append(stamp)
             images.append(folder / name)
     source = find_beside(image_list, (_TUM_POSES,))
-    poses = None if source is None else read_poses(source)
+    poses = None if source is None else read_trajectory(source)
     if not isinstance(poses, Trajectory) or not len(poses.stamps):
         raise ValueError(
             f"poses are needed beside {image_list.name}: {_TUM_POSES}, "

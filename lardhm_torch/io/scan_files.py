@@ -34,11 +34,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.io.bag_scans import is_bag_folder, read_bag
+from lardhm_torch.io.bag_files import is_bag_folder
+from lardhm_torch.io.bag_scans import read_bag
 from lardhm_torch.io.e57 import read_e57
 from lardhm_torch.io.frames import placed
 from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import las_pieces, read_las
+from lardhm_torch.io.moving_sensor import seen_from_track
 from lardhm_torch.io.notes import Note, ScanReport, check_notes
 from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
 from lardhm_torch.io.origins import scans_from, unused_origin, with_origins
@@ -53,6 +55,7 @@ from lardhm_torch.scans import Scans, concatenate_scans
 
 PathLike = str | os.PathLike[str]
 PIECE_RAYS = 1 << 18  # rays of a piece; their samples take about 100 MB
+PACKET_RAYS = 1 << 15  # rays of a moving sensor that are given together as one scan
 
 _READERS: dict[str, Callable[[Path], Readout]] = {
     ".npz": read_npz,
@@ -92,20 +95,24 @@ class _Choice:
         origin: Sequence[float] | None,
         frame: str | None,
         poses_frame: str | None,
+        sensor_frame: str | None,
         topic: str | Sequence[str],
         camera: Camera | None,
         strict: bool,
     ) -> None:
         if frame not in (None, "sensor", "world"):
             raise ValueError(f'frame must be "sensor", "world" or None; got {frame!r}')
-        if poses_frame not in (None, "camera", "lidar"):
-            raise ValueError(f'poses_frame must be "camera", "lidar" or None; got {poses_frame!r}')
         self.origin, self.frame, self.poses_frame = origin, frame, poses_frame
         self.strict = strict
         topics = (topic,) if isinstance(topic, str) else tuple(topic)
         self.readers: dict[str, Callable[[Path], Readout]] = {
             **_READERS,
-            **dict.fromkeys(_BAGS, partial(read_bag, topics=topics)),
+            **dict.fromkeys(
+                _BAGS,
+                partial(
+                    read_bag, topics=topics, poses_frame=poses_frame, sensor_frame=sensor_frame
+                ),
+            ),
             ".bin": partial(read_kitti, poses_frame=poses_frame),
             "a folder of depth images": partial(read_rgbd, camera=camera or Camera()),
         }
@@ -117,6 +124,7 @@ def load_scans(
     *,
     frame: str | None = None,
     poses_frame: str | None = None,
+    sensor_frame: str | None = None,
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
     strict: bool = False,
@@ -135,7 +143,9 @@ def load_scans(
         frame: what the points of PLY, PCD, text and LAS files are in. "sensor": the pose of each
             file (a pose file's, or VIEWPOINT) moves them into the world; "world": a pose file only
             says where the sensor stood; None: as "world", but pose files are not looked for.
-        poses_frame: whose poses a pose file beside KITTI scans holds, "camera" or "lidar".
+        poses_frame: whose poses a pose file holds, "camera" or "lidar"; of a bag, the frame of tf
+            whose poses the topic of poses holds, if it does not say so.
+        sensor_frame: of a bag, the frame of the sensor where clouds are in another one.
         topic: of a bag's clouds, of its poses, or both; needed if there are several.
         camera: of a folder of depth images.
         strict: refuse whatever would have to be guessed.
@@ -149,7 +159,7 @@ def load_scans(
     Warns:
         ScanFileWarning: part of a file was left out.
     """
-    choice = _Choice(origin, frame, poses_frame, topic, camera, strict)
+    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
     files = expand_paths(path, _READERS, _kind_of_folder)
     readouts = [_read(file, choice) for file in files]
     if origin is not None and not any(readout.needs_origin for readout in readouts):
@@ -176,6 +186,7 @@ def iter_scans(
     *,
     frame: str | None = None,
     poses_frame: str | None = None,
+    sensor_frame: str | None = None,
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
     strict: bool = False,
@@ -184,16 +195,24 @@ def iter_scans(
     """The scans of `load_scans` one by one, each with its own origin alone.
 
     A file is read when its turn comes, so that a folder of any length needs the memory of one file.
+    The rays of a moving sensor (LAS with a trajectory by GPS time), each with an origin of its own,
+    come in packets of 32,768 in the order of time.
 
     Args and errors: as `load_scans`; an error comes when the file's turn comes, and that no file
     needs the origin given comes at the end, unless there is one file only.
     """
-    choice = _Choice(origin, frame, poses_frame, topic, camera, strict)
-    for scans in _scans_of_each_file(path, choice, report, max_rays=None):
-        for number in range(scans.num_scans):
-            scan = scans.select(scans.scan_id == number)
-            origins, of_all = scans.origins[number : number + 1], torch.zeros_like(scan.scan_id)
-            yield Scans(origins, scan.ends, of_all, scan.is_return, scan.target_index)
+    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
+    for scans, moves in _scans_of_each_file(path, choice, report, max_rays=None):
+        order = scans.scan_id.argsort(stable=True)
+        counts = scans.scan_id.bincount(minlength=scans.num_scans).tolist()
+        for number, rays in enumerate(order.split(PACKET_RAYS if moves else counts)):
+            scan = scans.select(rays)
+            if moves:
+                used, scan_id = scan.scan_id.unique(return_inverse=True)
+            else:
+                used, scan_id = torch.tensor([number]), torch.zeros_like(scan.scan_id)
+            origins = scans.origins[used]
+            yield Scans(origins, scan.ends, scan_id, scan.is_return, scan.target_index)
 
 
 def iter_pieces(
@@ -202,6 +221,7 @@ def iter_pieces(
     *,
     frame: str | None = None,
     poses_frame: str | None = None,
+    sensor_frame: str | None = None,
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
     strict: bool = False,
@@ -215,8 +235,8 @@ def iter_pieces(
 
     Args and errors: as `iter_scans`; an error comes when the piece's turn comes.
     """
-    choice = _Choice(origin, frame, poses_frame, topic, camera, strict)
-    for scans in _scans_of_each_file(path, choice, report, max_rays):
+    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
+    for scans, _ in _scans_of_each_file(path, choice, report, max_rays):
         for start in range(0, len(scans), max_rays):
             yield scans.select(torch.arange(start, min(len(scans), start + max_rays)))
 
@@ -226,8 +246,11 @@ def _scans_of_each_file(
     choice: _Choice,
     report: ScanReport | None,
     max_rays: int | None,
-) -> Iterator[Scans]:
-    """The scans of one file after the other; of some formats in pieces of max_rays."""
+) -> Iterator[tuple[Scans, bool]]:
+    """The scans of one file after the other, and whether each of their rays has its own origin.
+
+    Some formats come in pieces of max_rays.
+    """
     files = expand_paths(path, _READERS, _kind_of_folder)
     origin_is_used, placeholders = choice.origin is None, 0
     for number, file in enumerate(files):
@@ -241,7 +264,8 @@ def _scans_of_each_file(
             if placeholders == 1 and number + 1 < len(files) and choice.origin is None:
                 # The first scan of a drive may stand at zero; if the next does, too, none does.
                 placeholders += _num_placeholders(_read(files[number + 1], choice))
-            yield _finished(readout, file, choice, placeholders, report)
+            scans = _finished(readout, file, choice, placeholders, report)
+            yield scans, readout.times is not None and scans.num_scans > 1
     if not origin_is_used:
         raise unused_origin(choice.origin or (), files)
 
@@ -318,6 +342,10 @@ def _placed(readout: Readout, file: Path, choice: _Choice) -> Readout:
     """Points in the world frame, as far as it is known which frame they are in."""
     if file.suffix.lower() in _MAY_HOLD_ZEROS:
         readout = without_zeros(readout)
+    if choice.origin is None and choice.frame != "sensor":
+        tracked = seen_from_track(readout, file)
+        if tracked is not None:
+            return tracked
     return placed(readout, file, choice.frame, choice.poses_frame)
 
 
