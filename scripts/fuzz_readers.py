@@ -35,6 +35,9 @@ from healthy_files import (
     write_las,
     write_pcd,
     write_ply,
+    write_ply_lists,
+    write_pts,
+    write_ptx,
     write_tum,
 )
 
@@ -61,6 +64,15 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
             np.savez_compressed(path, **np.load(path))
     elif extension == "npy":
         np.save(path, points)
+    elif name.startswith("ply-lists"):
+        write_ply_lists(path, points, name.endswith("ascii"))
+    elif extension == "pts":
+        write_pts(path, np.array_split(points, 3 if variant else 1))
+    elif extension == "ptx":
+        write_ptx(path, points, POSES, bool(variant))
+    elif name.startswith("bin-"):
+        columns = np.hstack([points, rng.random((NUM_POINTS, 2))])[:, : 5 if variant == "5" else 4]
+        columns.astype("<f4" if variant == "5" else "<f8").tofile(path)
     elif extension == "ply":
         write_ply(path, points, variant)
     elif extension == "pcd":
@@ -133,6 +145,11 @@ def healthy_images(
         (folder / "depth.txt").write_text("# stamp file\n" + "".join(lines))
         write_tum(folder / "groundtruth.txt", [100.4, 100.6, 101.4, 101.6], POSES[[0, 0, 1, 1]])
     files = {"png": path, "pose": folder / "frame-000001.pose.txt"}
+    if variant == "pairs":
+        lines = [f"{line.strip()} {100 + i}.5 rgb/{i}.png\n" for i, line in enumerate(lines)]
+        (folder / "depth.txt").rename(folder / "associations.txt")
+        (folder / "associations.txt").write_text("".join(lines))
+        return folder / "associations.txt", folder
     files |= {"camera": folder / "camera-intrinsics.txt", "list": folder / "depth.txt"}
     return files.get(variant, folder / "groundtruth.txt"), folder
 
@@ -141,11 +158,14 @@ POSES = np.tile(np.eye(4), (2, 1, 1))
 POSES[1, :3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
 FORMATS = {  # and the library that reads or makes them
     **dict.fromkeys(("npz", "npz-deflate", "npy", "csv", "txt", "xyz"), ""),
+    **dict.fromkeys(("pts", "pts-several", "ptx", "ptx-zeros", "bin-5", "bin-double"), ""),
+    **dict.fromkeys(("ply-lists-ascii", "ply-lists-binary"), ""),
     **dict.fromkeys(("bin", "poses", "poses-tum", "map-pt"), ""),
     **dict.fromkeys(("ply-ascii", "ply-binary_little_endian", "ply-binary_big_endian"), ""),
     **dict.fromkeys(("pcd-ascii", "pcd-binary", "pcd-binary_compressed"), ""),
     **dict.fromkeys(("las", "laz-6", "laz-3"), "lazrs"),
     **dict.fromkeys(("depth-png", "depth-pose", "depth-camera", "tum-list", "tum-poses"), "PIL"),
+    "tum-pairs": "PIL",
     **dict.fromkeys(("bag", "bag-bz2", "bag-lz4", "db3", "db3-zstd-message"), "rosbags"),
     **dict.fromkeys(("mcap", "mcap-zstd", "mcap-laser", "mcap-livox", "bag-livox"), "rosbags"),
     **dict.fromkeys(("wal", "metadata"), "rosbags"),
@@ -202,7 +222,8 @@ def read(name: str, path: Path) -> None:
     elif name == "npy":
         load_points(path)
     else:
-        scans = load_scans(path, origin=(0, 0, 0) if name.startswith("la") else None)
+        given = name.startswith(("la", "pts", "ply-lists", "bin-"))
+        scans = load_scans(path, origin=(0, 0, 0) if given else None)
         assert len(scans.ends) == len(scans.scan_id)
 
 

@@ -44,6 +44,54 @@ def write_ply(path: Path, points: np.ndarray, encoding: str) -> None:
     path.write_bytes(header.encode() + body)
 
 
+def write_ply_lists(path: Path, points: np.ndarray, is_ascii: bool) -> None:
+    """Vertices that each have a list after their coordinates, and a list element before them."""
+    encoding = "ascii" if is_ascii else "binary_little_endian"
+    lines = ["ply", f"format {encoding} 1.0", "element strip 2", "property list uchar int i"]
+    lines += [f"element vertex {len(points)}", *(f"property double {name}" for name in "xyz")]
+    header = "\n".join([*lines, "property list uchar float seen", "end_header", ""])
+    lengths = np.arange(len(points)) % 4
+    if is_ascii:
+        rows = [
+            f"{' '.join(map(repr, row))} {n}{' 0.5' * n}"
+            for row, n in zip(points.tolist(), lengths, strict=True)
+        ]
+        path.write_text(header + "2 1 2\n0\n" + "\n".join(rows) + "\n")
+        return
+    seen = [bytes([n]) + np.full(n, 0.5, "<f4").tobytes() for n in lengths]
+    rows = [row.astype("<f8").tobytes() + tail for row, tail in zip(points, seen, strict=True)]
+    strips = b"\2" + np.arange(2, dtype="<i4").tobytes() + b"\0"
+    path.write_bytes(header.encode() + strips + b"".join(rows))
+
+
+def write_pts(path: Path, scans: Sequence[np.ndarray]) -> None:
+    """Tables of points, each with a count line before it."""
+    tables = [
+        f"{len(points)}\n" + "".join(f"{x} {y} {z} -1200 1 2 3\n" for x, y, z in points)
+        for points in scans
+    ]
+    path.write_text("".join(tables))
+
+
+def write_ptx(path: Path, points: np.ndarray, poses: np.ndarray, with_zeros: bool) -> None:
+    """One scan a pose, its points on a grid of 15 columns; with_zeros: a grid of angles with gaps."""
+    rows = len(points) // 15
+    points = points[: 15 * rows]
+    if with_zeros:
+        azimuth, elevation = np.meshgrid(np.arange(15) / 10, np.arange(rows) / 20, indexing="ij")
+        beams = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)]
+        points = 3 * np.stack([*beams, np.sin(elevation)], axis=-1).reshape(-1, 3).round(6)
+        points[::7] = 0
+    text = ""
+    for pose in poses:
+        header = [pose[:3, 3], *pose[:3, :3].T, *pose.T]
+        lines = [" ".join(map(repr, row.tolist())) for row in [*header, *points]]
+        text += (
+            f"15\n{rows}\n" + "\n".join(lines[:8] + [f"{line} 0.5" for line in lines[8:]]) + "\n"
+        )
+    path.write_text(text)
+
+
 def write_pcd(path: Path, points: np.ndarray, encoding: str) -> None:
     """A PCD file with VIEWPOINT; compressed ones hold copies that run into themselves."""
     header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"

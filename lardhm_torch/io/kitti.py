@@ -57,7 +57,9 @@ def _layout(content: NDArray[np.uint8], is_nuscenes: bool) -> tuple[str, int]:
         if len(content) and len(content) % (np.dtype(layout[0]).itemsize * layout[1]) == 0
     }
     kitti = scores.get(_LAYOUTS[0], np.inf)
-    best = min(scores, key=scores.__getitem__, default=_LAYOUTS[0])
+    least = min(scores.values(), default=np.inf)
+    # Points of three columns also fit six: of what fits alike, the first is meant.
+    best = next((lay for lay in scores if scores[lay] <= least + _CLEARLY / 2), _LAYOUTS[0])
     if is_nuscenes and ("<f4", 5) in scores and scores["<f4", 5] < scores[best] + _CLEARLY:
         return "<f4", 5
     enough = len(content) >= _LEAST_POINTS * 16
