@@ -13,9 +13,9 @@
 | folder of depth images (7-Scenes, TUM) | 16-bit depth, camera frame | pose files |
 
 Poses are a file poses.txt, groundtruth.txt or trajectory.txt beside the scans or one folder up,
-each line in KITTI's, KITTI-360's or TUM's format (`poses.pose_beside`). Whether the points of a PLY, PCD, text
-or LAS file lie in the world or still in the sensor's frame, no file says: the world is assumed,
-``frame="sensor"`` says the other. The rest is in the readers' docstrings.
+each line in KITTI's, KITTI-360's or TUM's format (`poses.pose_beside`). Whether the points of a
+PLY, PCD, text or LAS file lie in the world or still in the sensor's frame, no file says: the world
+is assumed, ``frame="sensor"`` says the other. The rest is in the readers' docstrings.
 
 Coordinates are float64 from the file on, so UTM loses nothing. Columns named scan_id, is_return
 and target_index (or return_number) are read where a format has named columns. Points that are NaN
