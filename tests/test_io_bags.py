@@ -175,6 +175,10 @@ def test_tf_that_stands_still_gives_way_to_a_pose_topic(tmp_path):
     assert np.allclose(scans.ends, np.tile(points, (2, 1)), atol=1e-5)
     scans = load_scans(write_bag(tmp_path / "b.bag", lambda maker: messages(maker, False)))
     assert np.allclose(scans.origins, MOUNT[:3, 3])  # a scanner on its tripod
+    with pytest.raises(ValueError, match="refuses a guess: lidar never moves in tf"):
+        load_scans(tmp_path / "b.bag", strict=True)
+    strict = load_scans(tmp_path / "b.bag", strict=True, sensor_frame="lidar")
+    assert np.array_equal(strict.origins, scans.origins)
 
 
 def test_a_named_pose_topic_goes_before_tf(tmp_path):

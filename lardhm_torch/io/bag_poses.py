@@ -102,7 +102,7 @@ def cloud_poses(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -
         return _seen_in_fixed_frame(sources, frame, stamps)
     is_known_to_tf = tree.has_parent(frame) and not sources.is_named
     if is_known_to_tf and (not sources.topics or tree.moves(frame)):
-        poses = _by_tf(tree, frame, stamps)
+        poses = _by_tf(sources, frame, stamps)
     elif len(sources.topics) == 1:
         poses = _by_topic(sources, frame, stamps)
     else:
@@ -138,12 +138,12 @@ def _sensors_below(tree: TransformTree, frame: str) -> list[str]:
     return [name for name in tree.leaves(frame) if not _has_fixed_name(name)]
 
 
-def _by_tf(tree: TransformTree, frame: str, stamps: NDArray[np.float64]) -> CloudPoses:
+def _by_tf(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -> CloudPoses:
     """Clouds in their sensor's frame, moved by all transforms up to the root."""
-    poses, gaps = tree.root_from(frame, stamps)
+    poses, gaps = sources.tree.root_from(frame, stamps)
     notes = [Note(f"poses of {frame} from tf")]
-    if not tree.moves(frame):
-        cure = "--topic names a topic of poses if it moved"
+    if not sources.tree.moves(frame):
+        cure = "" if sources.sensor_frame else f"sensor_frame='{frame}' confirms it"
         notes = [Note(f"{frame} never moves in tf: taken to stand still", cure=cure)]
     return CloudPoses(poses, poses[:, :3, 3], gaps, tuple(notes))
 
