@@ -92,6 +92,22 @@ def test_a_part_that_metadata_lists_and_is_missing_is_an_error(tmp_path, ending)
         load_scans(bag)
 
 
+def test_a_gap_in_the_numbers_of_parts_warns_where_there_is_no_metadata(tmp_path):
+    bag = write_parts(tmp_path / "bag", metadata="")
+    (bag / "bag_1.mcap").unlink()
+    with pytest.warns(ScanFileWarning, match="parts 1 of bag are missing"):
+        assert load_scans(bag).num_scans == 2
+
+
+def test_recordings_in_one_folder_are_no_parts_of_a_bag(tmp_path):
+    bag = write_parts(tmp_path / "bag", metadata="")
+    for number in (2, 1, 0):
+        (bag / f"bag_{number}.mcap").rename(bag / f"run_{number + 1}.mcap")
+    report = ScanReport()
+    assert_rays(load_scans(bag, report=report), DRIVE)
+    assert len(report.files) == 3
+
+
 def test_a_part_that_is_still_compressed_is_an_error(tmp_path):
     bag = write_parts(tmp_path / "bag")
     (bag / "bag_1.mcap").rename(bag / "bag_1.mcap.zstd")

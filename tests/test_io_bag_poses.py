@@ -90,6 +90,28 @@ def test_registered_clouds_are_seen_from_the_sensor_that_odometry_carries(tmp_pa
         assert_rays(load_scans(path, **arguments), DRIVE, 2e-6)
 
 
+@pytest.mark.parametrize("name", ONE_OF_EACH)
+def test_registered_clouds_are_seen_from_the_mount_on_poses_without_a_frame(tmp_path, name):
+    def messages(maker, links):
+        for link in links:
+            yield maker.transform(MOUNT, 0.0, ("base", link), topic="/tf_static")
+        for number, (pose, scan) in enumerate(zip(DRIVE.poses, DRIVE.scans, strict=True)):
+            yield maker.pose(DRIVE.of_base[number], 10.0 + number, frame="map")
+            yield maker.cloud(scan @ pose[:3, :3].T + pose[:3, 3], 10.0 + number, frame="map")
+
+    path, report = (
+        write_bag(tmp_path / name, lambda maker: messages(maker, ["lidar"])),
+        ScanReport(),
+    )
+    assert_rays(load_scans(path, report=report), DRIVE, 2e-6)
+    assert "sensor taken to be at lidar (guess:" in str(report)
+    path = write_bag(tmp_path / f"b{name}", lambda maker: messages(maker, ["lidar", "imu"]))
+    with pytest.warns(ScanFileWarning, match="sensor at the poses of /pose .*poses_frame says of"):
+        load_scans(path)
+    scans = load_scans(path, poses_frame="base", sensor_frame="lidar", strict=True)
+    assert_rays(scans, DRIVE, 2e-6)
+
+
 def test_registered_clouds_without_any_pose_of_the_sensor_are_refused(tmp_path):
     def messages(maker):
         for number, scan in enumerate(DRIVE.scans):

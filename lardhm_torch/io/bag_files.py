@@ -6,7 +6,6 @@ the word of its headers nor unpack without limit. What the messages mean is `bag
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 from lardhm_torch.io.bag_chunks import Message, Unpacker
 from lardhm_torch.io.mcap import read_mcap
+from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import natural_key
 from lardhm_torch.io.ros1_bag import read_ros1
 from lardhm_torch.io.ros2_sqlite import read_sqlite, unmerged_log
@@ -35,7 +35,7 @@ class BagParts:
 
     files: list[Path]
     num_messages: int | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 def read_messages(path: Path) -> Iterator[Message]:
@@ -70,9 +70,16 @@ def is_bag_folder(folder: Path) -> bool:
     """
     if (folder / "metadata.yaml").is_file():
         return True
-    stems = [file.stem for file in folder.iterdir() if file.suffix.lower() in _STORAGE]
-    names = {re.sub(r"_\d+$", "", stem) for stem in stems}
-    return len(stems) > 0 and len(names) == 1 and not names & set(stems)
+    files = [file for file in folder.iterdir() if file.suffix.lower() in _STORAGE]
+    parts = [_part(file) for file in files]
+    return 0 in {number for _, number in parts} and len({name for name, _ in parts}) == 1
+
+
+def _part(file: Path) -> tuple[str, int]:
+    """The name of a bag and the number of its part; -1 for a file that is none."""
+    name, _, number = file.stem.rpartition("_")
+    is_part = bool(name) and number.isascii() and number.isdigit() and len(number) < 10
+    return (name, int(number)) if is_part else (file.stem, -1)
 
 
 def bag_parts(path: Path) -> BagParts:
@@ -92,18 +99,30 @@ def bag_parts(path: Path) -> BagParts:
     if isinstance(listed, list) and listed:
         files = [_listed_file(path, str(name)) for name in listed]
         others = [file.name for file in there if file not in files]
-        notes = (f"{', '.join(others)} left out: not in metadata.yaml",) if others else ()
+        text = f"{', '.join(others)} left out: not in metadata.yaml"
+        notes = (Note(text),) if others else ()
     else:
-        files, notes = _unlisted_files(path, found, there), ()
-        notes = ("metadata.yaml lists no files: all parts in the folder are read",)
+        files = _unlisted_files(path, found, there)
+        notes = (Note("metadata.yaml lists no files: all parts in the folder are read"),)
+        notes += _missing_parts(files)
     count = metadata.get("message_count")
     num_messages = count if isinstance(count, int) and count >= 0 else None
     return BagParts(files, num_messages, notes + _log_notes(files))
 
 
-def _log_notes(files: list[Path]) -> tuple[str, ...]:
+def _missing_parts(files: list[Path]) -> tuple[Note, ...]:
+    """A warning if the numbers of the parts have a gap."""
+    numbers = {_part(file)[1] for file in files}
+    missing = [number for number in range(len(numbers)) if number not in numbers]
+    if -1 in numbers or not missing:
+        return ()
+    names = ", ".join(map(str, missing[:5]))
+    return (Note(f"parts {names} of {files[0].parent.name} are missing", is_loss=True),)
+
+
+def _log_notes(files: list[Path]) -> tuple[Note, ...]:
     logs = [log.name for file in files if file.suffix == ".db3" and (log := unmerged_log(file))]
-    return (f"the recorder was killed: {', '.join(logs)} is merged",) if logs else ()
+    return (Note(f"the recorder was killed: {', '.join(logs)} is merged"),) if logs else ()
 
 
 def _metadata(path: Path) -> dict[str, Any]:

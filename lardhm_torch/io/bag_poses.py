@@ -221,11 +221,12 @@ def _mount_below(
     sources: PoseSources, topic: PoseTopic, stamps: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Note]:
     """Where the sensor sits in the frame that a topic of poses moves."""
-    child = sources.poses_frame or topic.child
+    child = sources.poses_frame or topic.child or _only_base(sources.tree)
     nowhere = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps))
     if not child or child not in sources.tree.frames:
         cure = f"poses_frame says of which frame {topic.name} is" if sources.tree.frames else ""
-        return *nowhere, Note(f"sensor at the poses of {topic.name}", cure=cure)
+        text = f"sensor at the poses of {topic.name}"
+        return *nowhere, Note(text, cure=cure, is_loss=bool(cure))
     if sources.sensor_frame is None and not _sensors_below(sources.tree, child):
         return *nowhere, Note(f"sensor at {child}, by the poses of {topic.name}")
     sensor, note = _sensor_below(sources, child)
@@ -233,6 +234,13 @@ def _mount_below(
     if found is None:
         raise ValueError(f"tf must connect {child} and {sensor}; it does not")
     return *found, note
+
+
+def _only_base(tree: TransformTree) -> str:
+    """The frame that carries the only sensor of tf; empty where there are none, or several."""
+    bases = [root for root in tree.roots if not _has_fixed_name(root)]
+    is_clear = len(bases) == 1 and len(_sensors_below(tree, bases[0])) == 1
+    return bases[0] if is_clear and not tree.has_moving_below(bases[0]) else ""
 
 
 def _sensor_below(sources: PoseSources, frame: str) -> tuple[str, Note]:

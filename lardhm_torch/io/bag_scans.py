@@ -149,7 +149,7 @@ def _common_frame(clouds: list[Cloud]) -> str:
 
 def _bag_notes(parts: BagParts, bag: _Bag, topic: str) -> list[Note]:
     notes = [Note(f"rays from {topic} ({bag.kinds[topic]})")]
-    notes += [Note(text) for text in parts.notes]
+    notes += parts.notes
     if parts.num_messages is not None and parts.num_messages != bag.num_messages:
         text = f"messages, but metadata.yaml promises {parts.num_messages}"
         notes.append(Note(text, bag.num_messages, is_loss=True))

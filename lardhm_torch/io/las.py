@@ -77,7 +77,7 @@ def _readout_of(points: Any, scales: NDArray[np.float64]) -> Readout:
     readout = Readout(
         ends,
         target_index=np.maximum(np.asarray(points.return_number, dtype=np.int64), 1),
-        origin_cure="The format has no place for it: convert to .npz with origins,",
+        origin_cure="Put its trajectory.txt (GPS time, x, y, z a line) or a pose file beside it",
         times=np.array(points.gps_time, dtype=np.float64) if has_times else None,
     )
     withheld = np.asarray(points.withheld).astype(bool)

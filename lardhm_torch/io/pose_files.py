@@ -216,7 +216,7 @@ def _kitti(path: Path, rows: NDArray[np.float64]) -> PoseFile:
         numbers, rows = rows[:, 0].astype(np.int64), rows[:, 1:]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
-    is_pose: NDArray[np.bool_] = np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
+    is_pose = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not is_pose.any():
         raise ValueError(f"{path} must hold finite poses; no line does")
     check_rigid(np.where(is_pose[:, None, None], poses, np.eye(4)), str(path))

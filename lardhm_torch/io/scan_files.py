@@ -6,16 +6,16 @@
 | ``.ply`` | properties x y z | properties ox oy oz, poses, or ``origin=`` |
 | ``.pcd`` | fields x y z | VIEWPOINT, poses, or ``origin=`` |
 | ``.xyz .txt .csv`` | columns x y z | columns ox oy oz, poses, or ``origin=`` |
-| ``.las .laz`` | scaled X Y Z | poses, or ``origin=`` |
+| ``.las .laz`` | scaled X Y Z | poses, a trajectory by GPS time, or ``origin=`` |
 | ``.bin`` (KITTI) | x y z intensity, sensor frame | poses |
 | ``.e57`` | cartesian or spherical, scanner frame | pose of each scan |
-| ``.bag .db3 .mcap``, folder of a ROS 2 bag | PointCloud2, its frame | tf, or a topic of poses |
+| ``.bag .db3 .mcap``, folder of a ROS 2 bag | clouds and laser scans | tf, or a topic of poses |
 | folder of depth images (7-Scenes, TUM) | 16-bit depth, camera frame | pose files |
 
 Poses are a file poses.txt, groundtruth.txt or trajectory.txt beside the scans or one folder up,
-each line in KITTI's or TUM's format (`poses.pose_beside`). Whether the points of a PLY, PCD, text
-or LAS file lie in the world or still in the sensor's frame, no file says: the world is assumed,
-``frame="sensor"`` says the other. The rest is in the readers' docstrings.
+each line in KITTI's, KITTI-360's or TUM's format (`poses.pose_beside`). Whether the points of a
+PLY, PCD, text or LAS file lie in the world or still in the sensor's frame, no file says: the world
+is assumed, ``frame="sensor"`` says the other. The rest is in the readers' docstrings.
 
 Coordinates are float64 from the file on, so UTM loses nothing. Columns named scan_id, is_return
 and target_index (or return_number) are read where a format has named columns. Points that are NaN

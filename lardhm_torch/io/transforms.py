@@ -62,6 +62,11 @@ class TransformTree:
         """All frames that have a parent or a child."""
         return set(self._edges).union(*self._edges.values())
 
+    @property
+    def roots(self) -> list[str]:
+        """The frames without a parent, sorted by name."""
+        return sorted(self.frames - set(self._edges))
+
     def has_parent(self, frame: str) -> bool:
         """Whether a frame has a parent."""
         return frame in self._edges
