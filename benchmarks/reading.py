@@ -30,7 +30,8 @@ warnings.simplefilter("ignore")
 from lardhm_torch import load_scans
 seconds = {}
 for path in sys.argv[1:]:
-    options = {} if path.endswith((".ptx", ".npz", ".pcd", ".e57", ".ply")) else {"origin": (1.0, 2.0, 3.0)}
+    has_origin = path.endswith((".ptx", ".npz", ".pcd", ".e57", ".ply"))
+    options = {} if has_origin else {"origin": (1.0, 2.0, 3.0)}
     try:
         for _ in range(3):
             begin = time.perf_counter()

@@ -11,6 +11,7 @@ python3 -m venv "$folder/venv"
 "$folder/venv/bin/pip" install -q pye57==0.4.19 numpy==2.2.6
 "$folder/venv/bin/python" - "$folder/scan.e57" <<'PYTHON'
 import sys
+from importlib.metadata import version
 
 import numpy as np
 import pye57
@@ -23,7 +24,7 @@ with pye57.E57(sys.argv[1], mode="w") as file:
 with pye57.E57(sys.argv[1]) as file:
     read = file.read_scan_raw(0)["cartesianY"]
 error = np.abs(read - northing).max()
-print(f"pye57 {pye57.__version__}: written {northing.dtype}, read {read.dtype}")
+print(f"pye57 {version('pye57')}: written {northing.dtype}, read {read.dtype}")
 print(f"largest error of a northing near 4,500,000 m: {error:.3f} m")
 assert 0.2 < error <= 0.25, "coordinates keep their precision now"
 PYTHON

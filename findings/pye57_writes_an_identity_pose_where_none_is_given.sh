@@ -11,6 +11,7 @@ python3 -m venv "$folder/venv"
 "$folder/venv/bin/pip" install -q pye57==0.4.19 numpy==2.2.6
 "$folder/venv/bin/python" - "$folder/scan.e57" <<'PYTHON'
 import sys
+from importlib.metadata import version
 
 import numpy as np
 import pye57
@@ -21,7 +22,7 @@ with pye57.E57(sys.argv[1], mode="w") as file:
 with pye57.E57(sys.argv[1]) as file:
     header = file.get_header(0)
     has_pose = header.has_pose()
-    print(f"pye57 {pye57.__version__}: has_pose() is {has_pose}")
+    print(f"pye57 {version('pye57')}: has_pose() is {has_pose}")
     print(f"translation {header.translation.tolist()}, rotation {header.rotation.tolist()}")
 assert has_pose, "a scan without a pose stays one now"
 PYTHON
