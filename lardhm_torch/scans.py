@@ -130,6 +130,8 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
     dims = sorted({part.dim for part in parts})
     if len(dims) > 1:
         raise ValueError(f"all scans must have the same dimension; got {dims}")
+    if len(parts) == 1:
+        return parts[0]
     before = [0]
     for part in parts:
         before.append(before[-1] + part.num_scans)

@@ -280,3 +280,21 @@ def test_a_folder_of_files_with_and_without_position_takes_an_origin_for_the_lat
     for read in (iter_scans, iter_pieces):
         with pytest.raises(ValueError, match="origin must be left out"):
             list(read(tmp_path, origin=(1, 2, 3)))
+
+
+@pytest.mark.parametrize("frame", ["sensor", "world"])
+def test_a_pose_file_beside_an_e57_without_a_pose_is_used_when_the_frame_is_said(tmp_path, frame):
+    points = sensor_points() if frame == "sensor" else world_points()
+    write_e57(tmp_path / "a.e57", [points])
+    write_poses(tmp_path / "poses.txt", pose()[None])
+    with pytest.raises(ValueError, match=r'poses\.txt beside it.*frame="sensor" or frame="world"'):
+        load_scans(tmp_path / "a.e57")
+    scans = load_scans(tmp_path / "a.e57", frame=frame)
+    np.testing.assert_allclose(scans.ends, world_points(), rtol=0, atol=1e-5)
+    assert scans.origins.tolist() == [POSITION.tolist()]
+
+
+def test_a_frame_is_refused_for_an_e57_with_poses(tmp_path):
+    write_e57(tmp_path / "a.e57", [sensor_points()], None, [POSITION])
+    with pytest.raises(ValueError, match=r"a\.e57.*other formats say it themselves"):
+        load_scans(tmp_path / "a.e57", frame="sensor")

@@ -14,6 +14,7 @@ from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.trajectories import move_points
 
 _WITHOUT_FRAME = (".ply", ".pcd", ".xyz", ".txt", ".csv", ".las", ".laz", ".pts")
+_WITH_POSES = (".e57", ".ptx")
 _LEAST_ROTATION = 1e-6
 
 
@@ -30,9 +31,10 @@ def placed(
     """
     if frame is None:
         return _as_written(readout, file)
-    if file.suffix.lower() not in _WITHOUT_FRAME:
+    if file.suffix.lower() not in _WITHOUT_FRAME and not _lacks_pose(readout, file):
         raise ValueError(
-            f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats say it themselves'
+            f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats say it themselves, '
+            "unless a single scan of .e57 or .ptx has no pose"
         )
     pose = pose_beside(file, poses_frame)
     if frame == "world":
@@ -47,6 +49,12 @@ def placed(
             f"(or VIEWPOINT in PCD); got none for points of {readout.dim} coordinates"
         )
     return moved(readout, pose)
+
+
+def _lacks_pose(readout: Readout, file: Path) -> bool:
+    """Whether a file of a format with poses has a single scan, and its pose is none."""
+    has_poses = file.suffix.lower() in _WITH_POSES
+    return has_poses and readout.needs_origin and readout.num_scans == 1
 
 
 def _as_written(readout: Readout, file: Path) -> Readout:

@@ -13,7 +13,7 @@ from lardhm_torch.io.poses import pose_beside
 from lardhm_torch.io.readout import Readout, without_zeros
 
 _LAYOUTS = [("<f4", 4), ("<f4", 3), ("<f4", 5), ("<f4", 6), ("<f8", 3), ("<f8", 4)]
-_PROBED_BYTES = 480 * 2000  # a whole number of points in every layout
+_PROBED_BYTES = 480 * 150  # a whole number of points in every layout
 _CLEARLY = 0.3  # in mean log variance: what another layout must be better by
 _WILD_EXPONENTS = 2.0  # standard deviation of the powers of ten of coordinates
 _LEAST_POINTS = 50  # fewer tell nothing about the layout
