@@ -67,6 +67,14 @@ def test_nuscenes_names_mean_five_columns(tmp_path):
     np.testing.assert_allclose(scans.ends, sensor_points(), rtol=0, atol=1e-6)
 
 
+def test_a_bin_file_of_cloudcompare_is_named(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"CCB2" + bytes(60))
+    with pytest.raises(
+        ValueError, match=r"a\.bin cannot be read: it is a \.bin file of CloudCompare"
+    ):
+        load_scans(tmp_path / "a.bin", origin=(0, 0, 0))
+
+
 def test_bytes_of_no_known_layout_are_an_error_that_says_so(tmp_path):
     with_columns(sensor_points(101), 5, 0)[:, [0, 1, 2, 3, 4, 4, 4]].astype("<f4").tofile(
         tmp_path / "a.bin"
@@ -84,6 +92,9 @@ HEADS = {
     "a label before": "# columns: id x y z n\n",
     "quotes": '"id" "x" "y" "z" "n"\n',
     "two slashes": "//id X Y Z n\n",
+    "units after the names": "# id,x_m,y_m,z_m,n\n",
+    "positions": "# id pos_x pos_y pos_z n\n",
+    "compass": "# id Easting Northing Height n\n",
     "the first line": "id x y z n\n",
 }
 

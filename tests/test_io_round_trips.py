@@ -8,6 +8,7 @@ import pytest
 from room_scan import POSITION, QUATERNION, sensor_points, with_zeros, world_points
 from scan_files import needs_laspy
 
+from lardhm_torch.io.notes import ScanReport
 from lardhm_torch.io.scan_files import load_points, load_scans
 
 UTM = np.array([500_000.0, 4_500_000.0, 100.0])
@@ -58,8 +59,10 @@ def test_organized_clouds_of_pypcd4_keep_their_points_without_measurement_out(tm
     cloud = pypcd4.PointCloud.from_xyz_points(points)
     cloud.metadata.width, cloud.metadata.height = 20, 12
     cloud.save(tmp_path / "a.pcd")
-    scans = load_scans(tmp_path / "a.pcd")
+    report = ScanReport()
+    scans = load_scans(tmp_path / "a.pcd", report=report)
     np.testing.assert_array_equal(scans.ends.numpy().astype(np.float32), points)
+    assert "60 points are not finite" in str(report)
 
 
 def test_pcd_padding_of_any_type_is_passed_over(tmp_path):

@@ -13,8 +13,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="lardhm",
         description="Continuous, probabilistic maps of occupancy from range scans.",
-        epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, KITTI bin, las, "
-        "e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
+        epilog="SCANS is one file or several, or a folder: npz, ply, pcd, xyz, csv, pts, ptx, "
+        "KITTI bin, las, e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
     )
     parser.set_defaults(report=None, num_far=0)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")

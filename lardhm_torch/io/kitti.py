@@ -29,6 +29,8 @@ def read_kitti(path: Path, poses_frame: str | None = None) -> Readout:
         ValueError: the file is no whole number of points, or the pose file has no pose for it.
     """
     content = np.fromfile(path, np.uint8)
+    if bytes(content[:3]) == b"CCB":
+        raise ValueError("it is a .bin file of CloudCompare. Save it as .e57, .las or .ply there")
     kind, columns = _layout(content, _is_nuscenes(path))
     ends = content.view(kind).reshape(-1, columns)[:, :3].astype(np.float64)
     readout = without_zeros(Readout(ends, origin_cure="Put its poses.txt beside it"))

@@ -105,6 +105,16 @@ def unused_origin(origin: Sequence[float], files: Sequence[Path]) -> ValueError:
     )
 
 
+def note_not_finite(readout: Readout) -> Readout:
+    """The readout with a note of how many ends are NaN or infinite: sampling drops these rays."""
+    if np.isfinite(readout.ends.sum()):  # takes no memory
+        return readout
+    count = int((~np.isfinite(readout.ends).all(axis=1)).sum())
+    return readout.noting(
+        Note("points are not finite (no measurement): sampling drops them", count)
+    )
+
+
 def scans_from(readout: Readout, file: Path) -> Scans:
     """The readout, which has its origins, as Scans.
 

@@ -6,6 +6,8 @@
 | ``.ply`` | properties x y z | properties ox oy oz, poses, or ``origin=`` |
 | ``.pcd`` | fields x y z | VIEWPOINT, poses, or ``origin=`` |
 | ``.xyz .txt .csv`` | columns x y z | columns ox oy oz, poses, or ``origin=`` |
+| ``.pts``, text with a count line | columns x y z | poses, or ``origin=`` |
+| ``.ptx`` | scanner frame | scanner position of each scan |
 | ``.las .laz`` | scaled X Y Z | poses, a trajectory by GPS time, or ``origin=`` |
 | ``.bin`` (KITTI) | x y z intensity, sensor frame | poses |
 | ``.e57`` | cartesian or spherical, scanner frame | pose of each scan |
@@ -19,7 +21,8 @@ is assumed, ``frame="sensor"`` says the other. The rest is in the readers' docst
 
 Coordinates are float64 from the file on, so UTM loses nothing. Columns named scan_id, is_return
 and target_index (or return_number) are read where a format has named columns. Points that are NaN
-are kept: sampling drops and counts them.
+are kept: sampling drops and counts them. Points at exactly zero are left out and counted: they mark
+beams without return. What was assumed is in a `notes.ScanReport`; docs/formats.md has the table.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ from lardhm_torch.io.las import las_pieces, read_las
 from lardhm_torch.io.moving_sensor import seen_from_track
 from lardhm_torch.io.notes import Note, ScanReport, check_notes
 from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
-from lardhm_torch.io.origins import scans_from, unused_origin, with_origins
+from lardhm_torch.io.origins import note_not_finite, scans_from, unused_origin, with_origins
 from lardhm_torch.io.paths import expand_paths
 from lardhm_torch.io.pcd import read_pcd
 from lardhm_torch.io.ply import ply_pieces, read_ply
@@ -358,6 +361,7 @@ def _finished(
 ) -> Scans:
     """The readout as Scans, once its sensor positions are known and its notes accepted."""
     readout = with_origins(readout, file, choice.origin, num_placeholders)
+    readout = note_not_finite(readout)
     scans = scans_from(readout, file)
     check_notes(file, readout.notes, choice.strict)
     if report is not None:

@@ -19,6 +19,10 @@ _UNIT = re.compile(r"[\[(][^\])]*[\])]")  # [m], (m)
 _OTHER_NAMES = {
     f"{name}{mark}{i}": "xyz"[i] for name in ("points", "coords") for mark in ":_" for i in range(3)
 }
+_OTHER_NAMES |= {"easting": "x", "northing": "y", "east": "x", "north": "y"}
+_OTHER_NAMES |= dict.fromkeys(("height", "elevation", "altitude", "up"), "z")
+_UNIT_ENDING = re.compile(r"(_m|/m)$")
+_POSITION = re.compile(r"(?:pos|position|point|coord|cartesian)_?([xyz])")
 _COUNTED = 3  # a first column that counts so many rows or more is no coordinate
 
 
@@ -153,8 +157,10 @@ def _entries(line: str) -> list[str]:
 
 
 def _name(word: str) -> str:
-    """The name of a column as we call it: "points:0" of ParaView is x."""
-    return _OTHER_NAMES.get(word, word)
+    """The name of a column as we call it: "points:0" of ParaView, "x_m" and "easting" are x."""
+    word = _UNIT_ENDING.sub("", word)
+    plain = _POSITION.fullmatch(word)
+    return plain[1] if plain else _OTHER_NAMES.get(word, word)
 
 
 def _is_number(word: str) -> bool:
