@@ -27,6 +27,8 @@ def with_columns(points, columns, seed):
             rng.integers(0, 256, len(points)),
             rng.integers(0, 32, len(points)),
             rng.random(len(points)) / 10,
+            rng.integers(0, 60_000, len(points)),
+            rng.integers(0, 4, len(points)),
         ],
         axis=1,
     )
@@ -34,7 +36,17 @@ def with_columns(points, columns, seed):
 
 
 @pytest.mark.parametrize(
-    ("kind", "columns"), [("<f4", 3), ("<f4", 5), ("<f4", 6), ("<f8", 3), ("<f8", 4)]
+    ("kind", "columns"),
+    [
+        ("<f4", 3),
+        ("<f4", 5),
+        ("<f4", 6),
+        ("<f8", 3),
+        ("<f8", 4),
+        ("<f4", 7),
+        ("<f4", 8),
+        ("<f8", 5),
+    ],
 )
 @pytest.mark.parametrize("count", [120, 240])
 def test_a_bin_file_of_another_layout_is_recognized_by_its_values(tmp_path, kind, columns, count):
@@ -75,10 +87,14 @@ def test_a_bin_file_of_cloudcompare_is_named(tmp_path):
         load_scans(tmp_path / "a.bin", origin=(0, 0, 0))
 
 
+def test_floats_of_the_other_byte_order_are_refused(tmp_path):
+    with_columns(sensor_points(), 4, 0).astype(">f4").tofile(tmp_path / "a.bin")
+    with pytest.raises(ValueError, match=r"a\.bin cannot be read: points of 16 bytes.*Convert"):
+        load_scans(tmp_path / "a.bin", origin=(0, 0, 0))
+
+
 def test_bytes_of_no_known_layout_are_an_error_that_says_so(tmp_path):
-    with_columns(sensor_points(101), 5, 0)[:, [0, 1, 2, 3, 4, 4, 4]].astype("<f4").tofile(
-        tmp_path / "a.bin"
-    )
+    np.zeros((101, 11), "<f4").tofile(tmp_path / "a.bin")
     with pytest.raises(ValueError, match=r"a\.bin cannot be read: points of 16 bytes.*Convert"):
         load_scans(tmp_path / "a.bin", origin=(0, 0, 0))
 
@@ -91,6 +107,8 @@ HEADS = {
     "commas": "# id, X, Y, Z, n\n# 240 points\n",
     "a label before": "# columns: id x y z n\n",
     "quotes": '"id" "x" "y" "z" "n"\n',
+    "percent": "% id x y z n\n",
+    "semicolon": "; id X Y Z n\n",
     "two slashes": "//id X Y Z n\n",
     "units after the names": "# id,x_m,y_m,z_m,n\n",
     "positions": "# id pos_x pos_y pos_z n\n",
@@ -123,7 +141,7 @@ def test_prose_that_mentions_coordinates_names_no_columns(tmp_path, comment):
     assert load_points(tmp_path / "a.xyz").tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-@pytest.mark.parametrize("start", [0, 1])
+@pytest.mark.parametrize("start", [0, 1, 1000])
 def test_a_first_column_that_counts_the_rows_is_no_coordinate(tmp_path, start):
     rows = np.hstack([np.arange(240)[:, None] + start, world_points()])
     np.savetxt(tmp_path / "a.txt", rows)

@@ -12,11 +12,12 @@ from lardhm_torch.io.notes import Note
 from lardhm_torch.io.poses import pose_beside
 from lardhm_torch.io.readout import Readout, without_zeros
 
-_LAYOUTS = [("<f4", 4), ("<f4", 3), ("<f4", 5), ("<f4", 6), ("<f8", 3), ("<f8", 4)]
-_PROBED_BYTES = 480 * 150  # a whole number of points in every layout
+_LAYOUTS = [("<f4", columns) for columns in (4, 3, 5, 6, 7, 8)]
+_LAYOUTS += [("<f8", columns) for columns in (3, 4, 5, 6)]
+_PROBED_BYTES = 3360 * 20  # a whole number of points in every layout
 _CLEARLY = 0.3  # in mean log variance: what another layout must be better by
 _WILD_EXPONENTS = 2.0  # standard deviation of the powers of ten of coordinates
-_LEAST_POINTS = 50  # fewer tell nothing about the layout
+_LEAST_POINTS = 30  # fewer tell nothing about the layout
 
 
 def read_kitti(path: Path, poses_frame: str | None = None) -> Readout:
@@ -65,9 +66,10 @@ def _layout(content: NDArray[np.uint8], is_nuscenes: bool) -> tuple[str, int]:
     if is_nuscenes and ("<f4", 5) in scores and scores["<f4", 5] < scores[best] + _CLEARLY:
         return "<f4", 5
     enough = len(content) >= _LEAST_POINTS * 16
-    if _LAYOUTS[0] in scores and (not enough or kitti <= scores[best] + _CLEARLY / 3):
+    makes_sense = not enough or np.isfinite(least)
+    if _LAYOUTS[0] in scores and makes_sense and (not enough or kitti <= least + _CLEARLY / 3):
         return _LAYOUTS[0]
-    if not scores or not enough or not scores[best] + _CLEARLY < kitti:
+    if not scores or not enough or not makes_sense or not least + _CLEARLY < kitti:
         raise ValueError(
             "points of 16 bytes (float32 x y z intensity) are needed; "
             f"got {len(content)} bytes of another layout. Convert the file to .npz, .pcd or .csv"

@@ -15,6 +15,7 @@ from lardhm_torch.io.readout import COLUMN_NAMES, Readout, readout_from_columns
 from lardhm_torch.io.records import read_table
 
 _PEEK_BYTES = 65_536
+_COMMENT_MARKS = ("#", "//", "%", ";", "!")
 _UNIT = re.compile(r"[\[(][^\])]*[\])]")  # [m], (m)
 _OTHER_NAMES = {
     f"{name}{mark}{i}": "xyz"[i] for name in ("points", "coords") for mark in ":_" for i in range(3)
@@ -49,7 +50,7 @@ def read_text(path: Path) -> Readout:
     """Columns x y [z], and where a header names them ox oy oz, scan_id, is_return, target_index.
 
     Values are parted by commas, semicolons, tabs or spaces. The header is the first line, or the
-    last comment (# or //) that names x and y and fits the columns; units in brackets are passed
+    last comment (# // % ; or !) that names x and y and fits the columns; units in brackets are passed
     over. A line with one whole number before the table is its count of points (PTS); the file may
     hold several such tables, each of them a scan. Without a header the first three columns (or two,
     if there are no more) are the coordinates, and further ones are not read.
@@ -78,7 +79,7 @@ def read_text(path: Path) -> Readout:
 
 def _layout_of(lines: list[str], suffix: str) -> _Layout:
     """Delimiter, names and count from the first lines of a file."""
-    is_comment = [line.startswith(("#", "//")) or not line for line in lines]
+    is_comment = [line.startswith(_COMMENT_MARKS) or not line for line in lines]
     num_comments = len(list(takewhile(bool, is_comment)))
     if num_comments == len(lines):
         raise ValueError("a line of numbers is needed; the file has none in its first 64 KiB")
@@ -182,7 +183,7 @@ def _names_in_comments(comments: list[str], width: int) -> list[str]:
     prose that mentions x and y names nothing.
     """
     for line in reversed(comments):
-        plain = _UNIT.sub("", line.lstrip("#/ \t")).lower()
+        plain = _UNIT.sub("", line.lstrip("#/%;! \t")).lower()
         words = [_name(word.strip("\"':")) for word in re.split(r"[\s,;]+", plain) if word]
         for names in (words[-width:], words):
             fits = len(names) == width or (len(names) < width and names[:1] == ["x"])
@@ -192,7 +193,7 @@ def _names_in_comments(comments: list[str], width: int) -> list[str]:
 
 
 def _counts_rows(column: NDArray[np.float64]) -> bool:
-    """Whether a column goes up by one from 0 or 1 on."""
-    if len(column) < _COUNTED or column[0] not in (0, 1):
+    """Whether a column goes up by one with every row, in whole numbers."""
+    if len(column) < _COUNTED or column[0] != np.floor(column[0]):
         return False
     return bool((np.diff(column) == 1).all())
