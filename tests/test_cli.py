@@ -101,7 +101,7 @@ def test_a_bag_of_a_robot_makes_a_map(folder, tmp_path, capsys):
     messages.append(maker.pose(poses[0], 100.0, topic="/goal"))
     maker.write(tmp_path / "robot.mcap", messages)
     error = fails(capsys, "fit", tmp_path / "robot.mcap", "-o", tmp_path / "map.pt")
-    assert "2 topics are poses" in error
+    assert "2 topics hold poses" in error
     assert "--topic" in error
     words = [tmp_path / "robot.mcap", "--topic", "/odom", "-o", tmp_path / "map.pt"]
     run("fit", *words, "--clusters", 100)
