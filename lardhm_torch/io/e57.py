@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
-from lardhm_torch.io.readout import Readout, whole_numbers
+from lardhm_torch.io.readout import Readout, rows_at_zero, whole_numbers
 from lardhm_torch.io.trajectories import move_points, poses_from_quaternions
 
 _PAGE = 1024  # bytes, the last four of which are a checksum
@@ -144,18 +144,21 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
 def _scan_of(columns: dict[str, NDArray[np.float64]]) -> Readout:
     """The rays of one scan, scanner frame; state 0: a hit, 1: a direction alone, 2: nothing."""
     state, points = columns["state"], _points_of(columns)
-    ranges = np.linalg.norm(points, axis=1)
-    is_zero = ranges == 0
-    is_hit, is_beam = (state == 0) & ~is_zero, (state == 1) & (ranges > 0)
-    longest = float(np.nanmax(ranges[is_hit], initial=0.0))
-    is_beam &= longest > 0
-    points[is_beam] *= (longest / ranges[is_beam])[:, None]
+    is_zero = rows_at_zero(points)
+    is_hit, is_beam = (state == 0) & ~is_zero, (state == 1) & ~is_zero
+    if is_beam.any():
+        ranges = np.linalg.norm(points, axis=1)
+        longest = float(np.nanmax(ranges[is_hit], initial=0.0))
+        is_beam &= longest > 0
+        points[is_beam] *= (longest / ranges[is_beam])[:, None]
     target = columns.get("returnIndex", np.zeros(len(points)))
     readout = Readout(
         points,
         is_return=is_hit,
         target_index=whole_numbers(target, "returnIndex", 0, 255) + 1,
-    ).select(is_hit | is_beam)
+    )
+    kept = is_hit | is_beam
+    readout = readout if kept.all() else readout.select(kept)
     counts = {
         _ZEROS: int(((state == 0) & is_zero).sum()),
         _NO_RETURNS: int(is_beam.sum()),

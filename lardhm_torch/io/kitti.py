@@ -14,7 +14,7 @@ from lardhm_torch.io.readout import Readout, without_zeros
 
 _LAYOUTS = [("<f4", columns) for columns in (4, 3, 5, 6, 7, 8)]
 _LAYOUTS += [("<f8", columns) for columns in (3, 4, 5, 6)]
-_PROBED_BYTES = 3360 * 20  # a whole number of points in every layout
+_PROBED_BYTES = 3360 * 8  # a whole number of points in every layout
 _CLEARLY = 0.3  # in mean log variance: what another layout must be better by
 _WILD_EXPONENTS = 2.0  # standard deviation of the powers of ten of coordinates
 _LEAST_POINTS = 30  # fewer tell nothing about the layout

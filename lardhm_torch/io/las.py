@@ -66,12 +66,11 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
 
 def _readout_of(points: Any, scales: NDArray[np.float64]) -> Readout:
     """The points that are not withheld; what lies within half a step of zero is at zero."""
-    ends = np.empty((len(points), 3))
-    for axis, name in enumerate("xyz"):
-        ends[:, axis] = points[name]
+    ends = np.stack([points.x, points.y, points.z], axis=1).astype(np.float64, copy=False)
     near = np.abs(ends[:, 0]) < scales[0] / 2
+    for axis in range(1, 3 if near.any() else 1):
+        near &= np.abs(ends[:, axis]) < scales[axis] / 2
     if near.any():
-        near &= (np.abs(ends) < scales / 2).all(axis=1)
         ends[near] = 0
     has_times = "gps_time" in points.point_format.dimension_names
     readout = Readout(
