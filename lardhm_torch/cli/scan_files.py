@@ -45,10 +45,14 @@ def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Ite
 
     if arguments.every != 1:
         raise ValueError("--every is not for tiled maps, which read files in pieces")
+    is_empty = True
     for piece in iter_pieces(arguments.scans, **_reading(arguments)):
+        is_empty = False
         thinned = thin_rays(piece, arguments.voxel)
         _count_far(thinned, arguments)
         yield _with_dim(thinned, arguments, dim)
+    if is_empty:
+        raise ValueError("SCANS must hold at least one usable ray; got none")
 
 
 def describe_scans(arguments: argparse.Namespace) -> ScanReport:

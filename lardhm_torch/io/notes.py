@@ -64,8 +64,8 @@ def check_notes(file: Path, notes: Iterable[Note], strict: bool) -> None:
 
 def no_ray_left(files: Sequence[Path], notes: Sequence[Note]) -> ValueError:
     """The error for files without a usable point; the notes say what was left out."""
-    said = "; ".join(sorted({str(note) for note in notes}))
-    return ValueError(f"{files[0]}: at least one point is needed; got none: {said}")
+    said = "".join(f"; {text}" for text in sorted({str(note) for note in notes}))
+    return ValueError(f"{files[0]}: at least one point is needed; got none{said}")
 
 
 class ScanReport:
