@@ -113,7 +113,7 @@ def build(train: Scans, choice: Choice, seed: int) -> Model:
     sampling = SamplingConfig(**choice.sampling)
     samples = sample_rays(train, sampling, seed=seed)
     model = LardHilbertMap(dim=train.dim, **choice.model)
-    hits = int(samples.labels.sum())
+    hits = int((samples.labels == 1).sum())
     num_clusters = 2 * hits // choice.hits_per_cluster if choice.hits_per_cluster else None
     config = FitConfig(**choice.fit)
     model.fit(samples.points, samples.labels, num_clusters, seed=seed, config=config)

@@ -126,7 +126,8 @@ def _check_unit(scans: Scans, keep: Tensor, config: SamplingConfig) -> None:
         )
         raise NoUsableRayError(
             f"coordinates must be in meters; {which} (median range {float(ranges[rays].median()):.3g}). "
-            "Scale points and sensor positions to meters, or give a SamplingConfig with other limits"
+            "Scale points and sensor positions to meters, correct the sensor positions "
+            "(`lardhm info SCANS` prints them), or give a SamplingConfig with other limits"
         )
 
 

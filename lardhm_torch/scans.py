@@ -130,6 +130,8 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
     dims = sorted({part.dim for part in parts})
     if len(dims) > 1:
         raise ValueError(f"all scans must have the same dimension; got {dims}")
+    if len(parts) == 1:
+        return parts[0]
     before = [0]
     for part in parts:
         before.append(before[-1] + part.num_scans)
@@ -140,6 +142,46 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
         torch.cat([part.is_return for part in parts]),
         torch.cat([part.target_index for part in parts]),
     )
+
+
+def every_scan(scans: Scans, step: int) -> Scans:
+    """Every ``step``-th scan, from the first on, numbered anew."""
+    kept = torch.arange(0, scans.num_scans, step, device=scans.ends.device)
+    rays = scans.select(scans.scan_id % step == 0)
+    scan_id = torch.div(rays.scan_id, step, rounding_mode="floor")
+    return Scans(scans.origins[kept], rays.ends, scan_id, rays.is_return, rays.target_index)
+
+
+def thin_rays(scans: Scans, voxel: float | None) -> Scans:
+    """The first of all rays of a scan that end in one voxel.
+
+    Hits and beams without return are thinned apart. Rays that are not finite are kept: sampling
+    counts them.
+
+    Args:
+        scans: range scans.
+        voxel: edge of the voxels, whose corners lie at multiples of it [m]; None: keep all rays.
+
+    Raises:
+        ValueError: voxel is not above 0.
+    """
+    if voxel is None:
+        return scans
+    if not 0 < voxel < float("inf"):
+        raise ValueError(f"voxel must be > 0 m and finite; got {voxel}")
+    finite = scans.ends.isfinite().all(dim=1)
+    rays = finite.nonzero().squeeze(1)
+    cells = (scans.ends[rays] / voxel).floor()
+    key = scans.scan_id[rays] * 2 + scans.is_return[rays]
+    for axis in range(scans.dim):  # numbered anew after every axis, so that no key overflows
+        number = cells[:, axis].unique(return_inverse=True)[1]
+        key = (key * (len(rays) + 1) + number).unique(return_inverse=True)[1]
+    ascending, order = key.sort(stable=True)
+    is_first = torch.ones_like(ascending, dtype=torch.bool)
+    is_first[1:] = ascending[1:] != ascending[:-1]
+    kept = ~finite
+    kept[rays[order[is_first]]] = True
+    return scans.select(kept)
 
 
 def split_rays(scans: Scans, ratio: float = 0.5, seed: int = 0) -> tuple[Scans, Scans]:

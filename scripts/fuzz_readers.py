@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import resource
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -33,6 +35,9 @@ from healthy_files import (
     write_las,
     write_pcd,
     write_ply,
+    write_ply_lists,
+    write_pts,
+    write_ptx,
     write_tum,
 )
 
@@ -59,6 +64,15 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
             np.savez_compressed(path, **np.load(path))
     elif extension == "npy":
         np.save(path, points)
+    elif name.startswith("ply-lists"):
+        write_ply_lists(path, points, name.endswith("ascii"))
+    elif extension == "pts":
+        write_pts(path, np.array_split(points, 3 if variant else 1))
+    elif extension == "ptx":
+        write_ptx(path, points, POSES, bool(variant))
+    elif name.startswith("bin-"):
+        columns = np.hstack([points, rng.random((NUM_POINTS, 2))])[:, : 5 if variant == "5" else 4]
+        columns.astype("<f4" if variant == "5" else "<f8").tofile(path)
     elif extension == "ply":
         write_ply(path, points, variant)
     elif extension == "pcd":
@@ -70,8 +84,14 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
     elif extension in ("bag", "db3", "mcap"):
         maker = BagMaker(extension == "bag")
         messages = bag_messages(maker, [points[:100], points[100:]], POSES)
+        if variant in ("laser", "livox"):
+            rays = points if variant == "livox" else np.abs(points[:, 0])
+            messages = [messages[0], getattr(maker, variant)(rays, 100.0)]
+            variant = ""
         messages.append(maker.transform(POSES[1], 100.0, ("odom", "base")))
         maker.write(path, messages, variant)
+    elif extension in ("calib", "metadata", "wal", "track"):
+        return healthy_sidecar(extension, folder, points)
     elif extension in ("depth", "tum"):
         return healthy_images(extension, variant, folder, rng)
     elif extension == "map":
@@ -88,6 +108,31 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
     return path, path
 
 
+def healthy_sidecar(name: str, folder: Path, points: np.ndarray) -> tuple[Path, Path]:
+    """A file beside a scan, and the scan that cannot be read without it."""
+    if name == "calib":
+        scan = write_kitti(folder, points)
+        (folder / "calib.txt").write_text("P0: 1 0 0 0\nTr: 0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3\n")
+        return folder / "calib.txt", scan
+    if name == "track":
+        write_las(folder / "scan.las", points, 6)
+        (folder / "trajectory.txt").write_text("# time x y z\n-0.1 1 2 3\n0.1 1 2 4\n")
+        return folder / "trajectory.txt", folder / "scan.las"
+    maker = BagMaker(is_ros1=False)
+    messages = bag_messages(maker, [points[:100], points[100:]], POSES)
+    if name == "metadata":
+        maker.write(folder / "bag.mcap", messages)  # its metadata.yaml is in the folder bag
+        (folder / "bag.mcap").rename(folder / "bag" / "bag.mcap")
+        return folder / "bag" / "metadata.yaml", folder / "bag"
+    scan = folder / "scan.db3"
+    database = sqlite3.connect(maker.write(folder / "live.db3", messages))
+    database.executescript("PRAGMA journal_mode=WAL; PRAGMA wal_autocheckpoint=0; VACUUM")
+    for ending in ("", "-wal"):
+        shutil.copy(folder / f"live.db3{ending}", folder / f"scan.db3{ending}")
+    database.close()
+    return scan.with_name("scan.db3-wal"), scan
+
+
 def healthy_images(
     layout: str, variant: str, folder: Path, rng: np.random.Generator
 ) -> tuple[Path, Path]:
@@ -100,6 +145,11 @@ def healthy_images(
         (folder / "depth.txt").write_text("# stamp file\n" + "".join(lines))
         write_tum(folder / "groundtruth.txt", [100.4, 100.6, 101.4, 101.6], POSES[[0, 0, 1, 1]])
     files = {"png": path, "pose": folder / "frame-000001.pose.txt"}
+    if variant == "pairs":
+        lines = [f"{line.strip()} {100 + i}.5 rgb/{i}.png\n" for i, line in enumerate(lines)]
+        (folder / "depth.txt").rename(folder / "associations.txt")
+        (folder / "associations.txt").write_text("".join(lines))
+        return folder / "associations.txt", folder
     files |= {"camera": folder / "camera-intrinsics.txt", "list": folder / "depth.txt"}
     return files.get(variant, folder / "groundtruth.txt"), folder
 
@@ -108,13 +158,19 @@ POSES = np.tile(np.eye(4), (2, 1, 1))
 POSES[1, :3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
 FORMATS = {  # and the library that reads or makes them
     **dict.fromkeys(("npz", "npz-deflate", "npy", "csv", "txt", "xyz"), ""),
+    **dict.fromkeys(("pts", "pts-several", "ptx", "ptx-zeros", "bin-5", "bin-double"), ""),
+    **dict.fromkeys(("ply-lists-ascii", "ply-lists-binary"), ""),
     **dict.fromkeys(("bin", "poses", "poses-tum", "map-pt"), ""),
     **dict.fromkeys(("ply-ascii", "ply-binary_little_endian", "ply-binary_big_endian"), ""),
     **dict.fromkeys(("pcd-ascii", "pcd-binary", "pcd-binary_compressed"), ""),
     **dict.fromkeys(("las", "laz-6", "laz-3"), "lazrs"),
     **dict.fromkeys(("depth-png", "depth-pose", "depth-camera", "tum-list", "tum-poses"), "PIL"),
+    "tum-pairs": "PIL",
     **dict.fromkeys(("bag", "bag-bz2", "bag-lz4", "db3", "db3-zstd-message"), "rosbags"),
-    **dict.fromkeys(("mcap", "mcap-zstd"), "rosbags"),
+    **dict.fromkeys(("mcap", "mcap-zstd", "mcap-laser", "mcap-livox", "bag-livox"), "rosbags"),
+    **dict.fromkeys(("wal", "metadata"), "rosbags"),
+    "calib": "",
+    "track": "lazrs",
     "e57": "pye57",
     "map-safetensors": "safetensors",
 }
@@ -166,7 +222,8 @@ def read(name: str, path: Path) -> None:
     elif name == "npy":
         load_points(path)
     else:
-        scans = load_scans(path, origin=(0, 0, 0) if name.startswith("la") else None)
+        given = name.startswith(("la", "pts", "ply-lists", "bin-"))
+        scans = load_scans(path, origin=(0, 0, 0) if given else None)
         assert len(scans.ends) == len(scans.scan_id)
 
 

@@ -9,6 +9,25 @@ from typing import Any
 import numpy as np
 
 CLOUD_TOPIC, POSE_TOPIC, FRAME = "/points", "/odom", "lidar"
+LIVOX_TYPES = {  # https://github.com/Livox-SDK/livox_ros_driver2/tree/master/msg
+    "livox_ros_driver2/msg/CustomPoint": """
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+""",
+    "livox_ros_driver2/msg/CustomMsg": """
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+""",
+}
 
 
 def write_ply(path: Path, points: np.ndarray, encoding: str) -> None:
@@ -23,6 +42,54 @@ def write_ply(path: Path, points: np.ndarray, encoding: str) -> None:
         order = "<" if "little" in encoding else ">"
         body = rows.astype(f"{order}f8").tobytes() + b"\3" + np.arange(3, dtype="<i4").tobytes()
     path.write_bytes(header.encode() + body)
+
+
+def write_ply_lists(path: Path, points: np.ndarray, is_ascii: bool) -> None:
+    """Vertices that each have a list after their coordinates, and a list element before them."""
+    encoding = "ascii" if is_ascii else "binary_little_endian"
+    lines = ["ply", f"format {encoding} 1.0", "element strip 2", "property list uchar int i"]
+    lines += [f"element vertex {len(points)}", *(f"property double {name}" for name in "xyz")]
+    header = "\n".join([*lines, "property list uchar float seen", "end_header", ""])
+    lengths = np.arange(len(points)) % 4
+    if is_ascii:
+        rows = [
+            f"{' '.join(map(repr, row))} {n}{' 0.5' * n}"
+            for row, n in zip(points.tolist(), lengths, strict=True)
+        ]
+        path.write_text(header + "2 1 2\n0\n" + "\n".join(rows) + "\n")
+        return
+    seen = [bytes([n]) + np.full(n, 0.5, "<f4").tobytes() for n in lengths]
+    rows = [row.astype("<f8").tobytes() + tail for row, tail in zip(points, seen, strict=True)]
+    strips = b"\2" + np.arange(2, dtype="<i4").tobytes() + b"\0"
+    path.write_bytes(header.encode() + strips + b"".join(rows))
+
+
+def write_pts(path: Path, scans: Sequence[np.ndarray]) -> None:
+    """Tables of points, each with a count line before it."""
+    tables = [
+        f"{len(points)}\n" + "".join(f"{x} {y} {z} -1200 1 2 3\n" for x, y, z in points)
+        for points in scans
+    ]
+    path.write_text("".join(tables))
+
+
+def write_ptx(path: Path, points: np.ndarray, poses: np.ndarray, with_zeros: bool) -> None:
+    """One scan a pose, its points on a grid of 15 columns; with_zeros: a grid of angles with gaps."""
+    rows = len(points) // 15
+    points = points[: 15 * rows]
+    if with_zeros:
+        azimuth, elevation = np.meshgrid(np.arange(15) / 10, np.arange(rows) / 20, indexing="ij")
+        beams = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)]
+        points = 3 * np.stack([*beams, np.sin(elevation)], axis=-1).reshape(-1, 3).round(6)
+        points[::7] = 0
+    text = ""
+    for pose in poses:
+        header = [pose[:3, 3], *pose[:3, :3].T, *pose.T]
+        lines = [" ".join(map(repr, row.tolist())) for row in [*header, *points]]
+        text += (
+            f"15\n{rows}\n" + "\n".join(lines[:8] + [f"{line} 0.5" for line in lines[8:]]) + "\n"
+        )
+    path.write_text(text)
 
 
 def write_pcd(path: Path, points: np.ndarray, encoding: str) -> None:
@@ -139,9 +206,12 @@ class BagMaker:
 
         self.is_ros1 = is_ros1
         self.store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        definitions = dict(LIVOX_TYPES)
         if is_ros1:
             transforms = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
+            definitions["tf2_msgs/msg/TFMessage"] = transforms
+        for kind, definition in definitions.items():
+            self.store.register(get_types_from_msg(definition, kind))
 
     def _make(self, kind: str, *values: Any) -> Any:
         return self.store.types[kind](*values)
@@ -166,6 +236,37 @@ class BagMaker:
         )  # fmt: skip
         return topic, "sensor_msgs/msg/PointCloud2", stamp, cloud
 
+    def laser(
+        self,
+        ranges: np.ndarray,
+        stamp: float,
+        angles: tuple[float, float] = (-np.pi, np.pi),
+        limits: tuple[float, float] = (0.1, 10.0),
+        topic: str = "/scan",
+    ):
+        """A LaserScan from the first to the last angle [rad], with range_min and range_max [m]."""
+        kind = "sensor_msgs/msg/LaserScan"
+        step = (angles[1] - angles[0]) / max(1, len(ranges) - 1)
+        values = np.asarray(ranges, dtype=np.float32)
+        nothing = np.empty(0, np.float32)
+        scan = self._make(
+            kind, self.header(stamp, FRAME), *angles, step, 0.0, 0.0, *limits, values, nothing
+        )
+        return topic, kind, stamp, scan
+
+    def livox(self, points: np.ndarray, stamp: float, topic: str = "/livox/lidar"):
+        """A CustomMsg of Livox's driver."""
+        kind, whole = "livox_ros_driver2/msg/CustomMsg", round(stamp * 1e9)
+        rows = [
+            self._make(
+                "livox_ros_driver2/msg/CustomPoint", 1000 * i, *map(float, row), 7, 16, i % 4
+            )
+            for i, row in enumerate(points)
+        ]
+        unused = np.zeros(3, np.uint8)
+        header = self.header(stamp, FRAME)
+        return topic, kind, stamp, self._make(kind, header, whole, len(rows), 1, unused, rows)
+
     def _parts(self, pose: np.ndarray, kind: str) -> Any:
         from scipy.spatial.transform import Rotation
 
@@ -188,15 +289,22 @@ class BagMaker:
             self._make(kind, self.header(stamp, frame), self._parts(pose, "Pose")),
         )
 
-    def odometry(self, pose: np.ndarray, stamp: float, child: str = FRAME, topic: str = POSE_TOPIC):
-        """An Odometry from the frame odom to child."""
+    def odometry(
+        self,
+        pose: np.ndarray,
+        stamp: float,
+        child: str = FRAME,
+        topic: str = POSE_TOPIC,
+        frame: str = "odom",
+    ):
+        """An Odometry from frame to child."""
         nothing = self._make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
         twist = self._make("geometry_msgs/msg/Twist", nothing, nothing)
         spread = np.zeros(36)
         kind = "nav_msgs/msg/Odometry"
         message = self._make(
             kind,
-            self.header(stamp, "odom"),
+            self.header(stamp, frame),
             child,
             self._make("geometry_msgs/msg/PoseWithCovariance", self._parts(pose, "Pose"), spread),
             self._make("geometry_msgs/msg/TwistWithCovariance", twist, spread),

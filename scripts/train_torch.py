@@ -38,7 +38,7 @@ def main(arguments: argparse.Namespace) -> None:
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, [0.05, 0.002], epochs=arguments.epochs, steps_per_epoch=len(loader)
     )
-    free_per_hit = (samples.labels == 0).sum() / samples.labels.sum()
+    free_per_hit = (samples.labels == 0).sum() / (samples.labels == 1).sum()
     loss_of = nn.BCEWithLogitsLoss(pos_weight=free_per_hit)  # hits are few
 
     kept = {"model": model, "average": average, "optimizer": optimizer, "schedule": schedule}

@@ -75,10 +75,10 @@ def test_without_poses_a_kitti_scan_is_taken_as_it_is_from_a_given_origin(tmp_pa
 @pytest.mark.parametrize(
     ("poses", "message"),
     [
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "2 lines for 3 scans, a.bin to c.bin"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "2 lines for 3 scans, a to c"),
         ("1 0 0 0\n" * 3, "poses.txt must have 12 numbers a line"),
         ("1 0 0 0 0 2 0 0 0 0 1 0\n" * 3, "rotations and positions; line 0 is none"),
-        ("1 0 0 0 0 1 0 0 0 0 1 nan\n" * 3, "rotations and positions; line 0 is none"),
+        ("1 0 0 0 0 1 0 0 0 0 1 nan\n" * 3, "must hold finite poses; no line does"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n" * 3, "rotations and positions; line 0 is none"),
     ],
 )

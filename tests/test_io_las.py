@@ -49,7 +49,7 @@ def test_importing_the_readers_does_not_import_laspy():
 
 @needs_laspy
 def test_las_asks_for_the_sensor_position(tmp_path):
-    with pytest.raises(ValueError, match=r"convert to \.npz with origins, or"):
+    with pytest.raises(ValueError, match=r"trajectory\.txt .* beside it or"):
         load_scans(write_las(tmp_path / "a.las", some_points() + UTM))
 
 

@@ -114,7 +114,7 @@ def test_the_viewpoint_of_a_pcd_is_the_origin_and_moves_nothing(tmp_path):
     turned = "1 2 3 0 0 0 1"
     content = pcd_header("binary", len(points), viewpoint=turned) + points.tobytes()
     (tmp_path / "scan.pcd").write_bytes(content)
-    scans = load_scans(tmp_path / "scan.pcd")
+    scans = load_scans(tmp_path / "scan.pcd", frame="world")
     assert scans.origins.tolist() == [[1, 2, 3]]
     assert np.array_equal(scans.ends, points)
 

@@ -156,3 +156,71 @@ def test_without_pillow_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(ImportError, match=r"depth\.png needs pillow.*lardhm_torch\[io\]"):
         load_scans(tmp_path)
+
+
+def tum_folder(folder, listed, per_meter=5000, intrinsics="5 0 15.5\n0 5 11.5\n0 0 1\n"):
+    """Two images of 2 m everywhere with stamps 1 and 2; what lists them, and how."""
+    (folder / "depth").mkdir()
+    for number in (1, 2):
+        image = np.full((24, 32), 2 * per_meter, dtype=np.uint16)
+        Image.fromarray(image).save(folder / f"depth/{number}.png")
+    name, line = listed
+    (folder / name).write_text("# made here\n" + "".join(line.format(i) for i in (1, 2)))
+    write_tum(folder / "groundtruth.txt", [1, 2], turning_poses(2))
+    (folder / "camera-intrinsics.txt").write_text(intrinsics)
+
+
+LISTS = [
+    ("depth.txt", "{0} depth/{0}.png\n"),
+    ("depth.txt", "{0} depth/{0}.png {0} rgb/{0}.png\n"),
+    ("associations.txt", "{0} depth/{0}.png {0} rgb/{0}.png\n"),
+    ("associations.txt", "{0} rgb/{0}.png {0} depth/{0}.png\n"),
+    ("associate.txt", "{0} rgb/{0}.png {0} ./depth/{0}.png\n"),
+]
+
+
+@pytest.mark.parametrize("listed", LISTS)
+@pytest.mark.parametrize("per_meter", [1000, 5000, 6553.5])
+def test_lists_of_pairs_and_other_depth_scales_are_read(tmp_path, listed, per_meter):
+    tum_folder(tmp_path, listed, int(per_meter))
+    scale = int(per_meter)
+    scans = load_scans(tmp_path, camera=Camera(depth_scale=scale, pixel_step=1), strict=True)
+    poses = turning_poses(2)
+    assert np.allclose(scans.origins, poses[:, :3, 3], rtol=0, atol=1e-8)
+    for number, pose in enumerate(poses):
+        local = (scans.ends[scans.scan_id == number].numpy() - pose[:3, 3]) @ pose[:3, :3]
+        assert np.allclose(local[:, 2], 2, rtol=0, atol=1e-6)
+        assert np.allclose(local[0, :2], [-15.5 / 5 * 2, -11.5 / 5 * 2], rtol=0, atol=1e-6)
+
+
+def test_the_default_depth_scale_is_a_guess(tmp_path):
+    tum_folder(tmp_path, LISTS[0])
+    with pytest.raises(ValueError, match=r"strict.*5000 depth units per meter.*--depth-scale"):
+        load_scans(tmp_path, strict=True)
+
+
+def test_a_negative_fy_turns_y_up(tmp_path):
+    tum_folder(tmp_path, LISTS[0], intrinsics="5 0 15.5\n0 -5 11.5\n0 0 1\n")
+    up = load_scans(tmp_path, camera=Camera(pixel_step=1))
+    (tmp_path / "camera-intrinsics.txt").write_text("5 0 15.5\n0 5 11.5\n0 0 1\n")
+    down = load_scans(tmp_path, camera=Camera(pixel_step=1))
+    pose = turning_poses(2)[0]
+    ours, theirs = [
+        (scans.ends[scans.scan_id == 0].numpy() - pose[:3, 3]) @ pose[:3, :3]
+        for scans in (up, down)
+    ]
+    assert np.allclose(ours, theirs * [1, -1, 1], rtol=0, atol=1e-6)
+
+
+def test_images_before_the_first_pose_are_left_out(tmp_path):
+    tum_folder(tmp_path, LISTS[2])
+    poses = turning_poses(2)
+    write_tum(tmp_path / "groundtruth.txt", [2, 3], poses)
+    with pytest.warns(UserWarning, match="1 depth images have no pose and are left out"):
+        scans = load_scans(tmp_path)
+    assert np.allclose(scans.origins, poses[:1, :3, 3], rtol=0, atol=1e-8)
+
+
+def test_a_depth_scale_is_checked():
+    with pytest.raises(ValueError, match="depth_scale must be > 0 units per meter"):
+        Camera(depth_scale=0)

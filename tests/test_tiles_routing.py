@@ -16,6 +16,7 @@ from lardhm_torch.tiles.records import Grid, read_records, route, unpack
 from lardhm_torch.tiles.routing import TilingConfig, add_scans, tile_scans
 
 CPU = torch.device("cpu")
+KNOWN = SamplingConfig(behind_samples=0)  # tiles have no unknown points
 
 
 def points_of(folder, index, limit=1 << 20):
@@ -40,7 +41,7 @@ def assert_same_points(points, labels, wanted, wanted_labels):
 def test_every_sample_is_in_the_core_of_the_tile_it_lies_in(tmp_path):
     (piece,) = room_pieces(pieces=1)
     folder = room_folder(tmp_path / "room", [piece])
-    samples, ledger = sample_rays(piece), read_ledger(folder)
+    samples, ledger = sample_rays(piece, KNOWN), read_ledger(folder)
     owner = tile_indices(samples.points, read_manifest(folder).origin, EDGE)
     assert len(ledger.cores) == len(owner.unique(dim=0))
     for index in ledger.cores:
@@ -56,7 +57,7 @@ def test_every_sample_is_in_the_core_of_the_tile_it_lies_in(tmp_path):
 def test_the_halo_of_a_tile_holds_the_points_just_outside(tmp_path):
     (piece,) = room_pieces(pieces=1)
     folder = room_folder(tmp_path / "room", [piece])
-    samples, manifest = sample_rays(piece), read_manifest(folder)
+    samples, manifest = sample_rays(piece, KNOWN), read_manifest(folder)
     for index in read_ledger(folder).tiles:
         corner = torch.tensor(manifest.origin, dtype=torch.float64) + EDGE * torch.tensor(index)
         offsets = samples.points - corner

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,11 +22,14 @@ def main(argv: list[str] | None = None) -> int:
         The exit code: 0, or 1 after an error, which is reported in one line, or 130 after Ctrl-C.
         An invalid command line exits with code 2.
     """
-    arguments = make_parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    arguments = make_parser().parse_args(_with_negative_numbers(words))
     prefix = f"lardhm {arguments.verb}"
     try:
         with _one_line_warnings(prefix):
             arguments.run(arguments)
+        if arguments.report is not None:
+            print(arguments.report, file=sys.stderr)
     except (ValueError, OSError, ImportError, MemoryError) as error:
         print(f"{prefix}: {_one_line(error)}", file=sys.stderr)
         return 1
@@ -49,6 +53,23 @@ def _one_line_warnings(prefix: str) -> Iterator[None]:
 
     warnings.formatwarning = format_warning
     try:
-        yield
+        with warnings.catch_warnings():  # a subcommand may silence some; its caller keeps them
+            yield
     finally:
         warnings.formatwarning = usual
+
+
+def _with_negative_numbers(words: Sequence[str]) -> list[str]:
+    """Join negative numbers to the option before them: argparse would take -1,2,3 for an option.
+
+    >>> _with_negative_numbers(["fit", "--origin", "-1,2,3"])
+    ['fit', '--origin=-1,2,3']
+    """
+    joined: list[str] = []
+    for word in words:
+        previous = joined[-1] if joined else ""
+        if re.fullmatch(r"--[a-z-]+", previous) and re.fullmatch(r"-[\d.][\d., eE+-]*", word):
+            joined[-1] = f"{previous}={word}"
+        else:
+            joined.append(word)
+    return joined

@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lardhm_torch.cli.outputs import MAP_SUFFIXES, check_output
-from lardhm_torch.cli.scan_files import iter_scans_of, read_scans, report_dropped
+from lardhm_torch.cli.scan_files import (
+    far_hits,
+    iter_scans_of,
+    read_scans,
+    report_dropped,
+    sampling_of,
+)
 from lardhm_torch.cli.tiling import update_folder
 
 if TYPE_CHECKING:
@@ -64,7 +70,7 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         raise ValueError("--resume, --view and --radius need --incremental")
     state = _tune_state(arguments.tune_state)
     scans = read_scans(arguments)
-    samples = sample_rays(scans, seed=arguments.seed)
+    samples = sample_rays(scans, sampling_of(arguments), seed=arguments.seed)
     report_dropped(samples.dropped)
     if not bool((samples.labels == 1).any()):
         raise ValueError(f"scans must hold at least one hit within range; got {samples.dropped}")
@@ -109,12 +115,12 @@ def _tune(
     from lardhm_torch import fine_tune, sample_rays
     from lardhm_torch.io.map_files import save_state
 
-    path = arguments.tune_state
+    path, sampling = arguments.tune_state, sampling_of(arguments)
     fine_tune(
         model,
         samples.points,
         samples.labels,
-        resample=lambda epoch: sample_rays(scans, seed=arguments.seed + epoch),
+        resample=lambda epoch: sample_rays(scans, sampling, seed=arguments.seed + epoch),
         seed=arguments.seed,
         state=state,
         after_epoch=(lambda state: save_state(state, path)) if path else None,
@@ -134,6 +140,7 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         num_clusters=arguments.clusters,
         radius=arguments.radius,
         checkpoint_every=arguments.checkpoint_every,
+        sampling=sampling_of(arguments),
         seed=arguments.seed,
     )
     scans = iter_scans_of(arguments)
@@ -152,7 +159,10 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         )  # fmt: skip
     if len(model) == 0:
         raise ValueError(f"SCANS must hold a usable ray; the map of {seen.scans} scans is empty")
-    print(f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}")
+    print(
+        f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}"
+        f"{far_hits(arguments)}"
+    )
 
 
 @contextmanager
@@ -182,7 +192,10 @@ def update(arguments: argparse.Namespace) -> None:
 
     model = LardHilbertMap.load(arguments.map)
     config = StreamConfig(
-        num_clusters=arguments.clusters, radius=arguments.radius, seed=arguments.seed
+        num_clusters=arguments.clusters,
+        radius=arguments.radius,
+        seed=arguments.seed,
+        sampling=sampling_of(arguments),
     )
     before = len(model)
     seen = stream_scans(model, iter_scans_of(arguments, model.dim), config, progress=True)
@@ -191,5 +204,5 @@ def update(arguments: argparse.Namespace) -> None:
     model.save(arguments.output)
     print(
         f"{seen.scans} scans, {seen.rays} rays -> {before} clusters became {len(model)} "
-        f"-> {arguments.output}"
+        f"-> {arguments.output}{far_hits(arguments)}"
     )

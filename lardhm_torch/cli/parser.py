@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
 from lardhm_torch.cli import learning, queries, tiling
+from lardhm_torch.cli.scan_arguments import add_ranges, add_reading, add_scans, finite
 
 MAP = "map file, or folder of a tiled map"
 FOLDER = "folder of the tiled map"
@@ -18,8 +18,9 @@ def make_parser() -> argparse.ArgumentParser:
         prog="lardhm",
         description="Continuous, probabilistic occupancy maps from range scans.",
         epilog="SCANS is one file, several files, or a folder. Formats: npz, ply, pcd, xyz, csv, "
-        "las, laz, KITTI bin, e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
+        "pts, ptx, las, laz, KITTI bin, e57, ROS bags (bag, db3, mcap), depth images (7-Scenes, TUM).",
     )
+    parser.set_defaults(report=None, num_far=0)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="COMMAND")
 
     def verb(run: Any, **defaults: Any) -> argparse.ArgumentParser:
@@ -48,7 +49,7 @@ def _scan_verbs(verb: Any) -> None:
     _seed(sub)
 
     sub = verb(learning.split)
-    _scans(sub)
+    add_scans(sub)
     sub.add_argument(
         "--ratio", type=float, default=0.5, help="fraction of training rays (default: 0.5)"
     )
@@ -64,7 +65,7 @@ def _scan_verbs(verb: Any) -> None:
 
 
 def _fit(sub: argparse.ArgumentParser) -> None:
-    _scans(sub)
+    add_scans(sub)
     _output(sub, "map to write: .pt, .pth or .safetensors")
     _clusters(sub, "total number of clusters (default: chosen from the data)")
     _neighbors(sub)
@@ -98,13 +99,14 @@ def _fit(sub: argparse.ArgumentParser) -> None:
         help="with --incremental: write a checkpoint every N scans (default: 1)",
     )
     _radius(sub)
+    add_ranges(sub)
     _dim(sub)
     _seed(sub)
 
 
 def _update(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
-    _scans(sub)
+    add_scans(sub)
     sub.add_argument(
         "-o",
         "--output",
@@ -113,6 +115,7 @@ def _update(sub: argparse.ArgumentParser) -> None:
     )
     _clusters(sub, "clusters of a scan of an unknown place (default: chosen from the data)")
     _radius(sub)
+    add_ranges(sub)
     _seed(sub)
 
 
@@ -139,7 +142,7 @@ def _file_verbs(verb: Any) -> None:
 def _picture_verbs(verb: Any) -> None:
     sub = verb(queries.view)
     sub.add_argument("map", metavar="MAP", help=MAP)
-    _scans(sub, nargs="*")
+    add_scans(sub, nargs="*")
     sub.add_argument(
         "--host",
         default="127.0.0.1",
@@ -162,25 +165,25 @@ def _picture_verbs(verb: Any) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
     _output(sub, "picture to write: .png")
     sub.add_argument(
-        "--slice", type=_finite, metavar="Z", help="draw the probability at height Z [m] instead"
+        "--slice", type=finite, metavar="Z", help="draw the probability at height Z [m] instead"
     )
     _resolution(sub, 0.05)
     _surface(sub)
     sub.add_argument(
-        "--azimuth", type=_finite, default=-60.0, help="camera azimuth [degrees] (default: -60)"
+        "--azimuth", type=finite, default=-60.0, help="camera azimuth [degrees] (default: -60)"
     )
     sub.add_argument(
-        "--elevation", type=_finite, default=40.0, help="camera elevation [degrees] (default: 40)"
+        "--elevation", type=finite, default=40.0, help="camera elevation [degrees] (default: 40)"
     )
     sub.add_argument(
-        "--cut-above", type=_finite, metavar="Z", help="remove the surface above height Z [m]"
+        "--cut-above", type=finite, metavar="Z", help="remove the surface above height Z [m]"
     )
 
 
 def _evaluation_verbs(verb: Any) -> None:
     sub = verb(queries.evaluate)
     sub.add_argument("map", metavar="MAP", help=MAP)
-    _scans(sub)
+    add_scans(sub)
     sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
     sub.add_argument(
         "--reliability", metavar="FILE", help="also draw reliability diagrams to a .png file"
@@ -188,14 +191,16 @@ def _evaluation_verbs(verb: Any) -> None:
     _seed(sub)
 
     sub = verb(queries.info)
-    sub.add_argument("map", metavar="MAP", help=MAP)
+    sub.add_argument("paths", nargs="+", metavar="PATH", help=f"{MAP}; or SCANS")
+    add_reading(sub)
     sub.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def _tile_verbs(verb: Any) -> None:
     sub = verb(tiling.tile)
-    _scans(sub)
+    add_scans(sub)
     sub.add_argument("-o", "--output", required=True, metavar="FOLDER", help=FOLDER)
+    add_ranges(sub)
     sub.add_argument("--edge", type=float, default=20.0, help="edge of a tile [m] (default: 20)")
     sub.add_argument(
         "--halo",
@@ -216,62 +221,6 @@ def _tile_verbs(verb: Any) -> None:
 
 
 # --- arguments that several subcommands share ---
-
-
-def _scans(sub: argparse.ArgumentParser, nargs: str = "+") -> None:
-    sub.add_argument(
-        "scans", nargs=nargs, metavar="SCANS", help="scan file, several files, or a folder"
-    )
-    sub.add_argument(
-        "--origin",
-        type=_numbers,
-        metavar="X,Y,Z",
-        help="sensor position for files that do not contain one [m]",
-    )
-    sub.add_argument(
-        "--frame",
-        choices=("sensor", "world"),
-        help="frame of the points beside a pose file. sensor: the poses transform them; world: "
-        "the poses only give the sensor positions (default: world, and pose files are not read)",
-    )
-    sub.add_argument(
-        "--topic",
-        action="append",
-        default=[],
-        help="topic of a bag's point clouds or poses; needed if there are several",
-    )
-    sub.add_argument(
-        "--camera",
-        type=_numbers,
-        metavar="FX,FY,CX,CY",
-        help="intrinsics of depth images that come without them [pixels]",
-    )
-    sub.add_argument(
-        "--pixel-step",
-        type=int,
-        default=4,
-        metavar="N",
-        help="read every Nth row and column of depth images (default: 4)",
-    )
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"must be numbers separated by commas; got {text!r}"
-        ) from error
-
-
-def _finite(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"must be a finite number; got {text!r}")
-    return value
 
 
 def _output(sub: argparse.ArgumentParser, text: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lardhm_torch.cli.outputs import check_output
-from lardhm_torch.cli.scan_files import read_scans
+from lardhm_torch.cli.scan_files import describe_scans, read_scans
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
@@ -158,8 +158,14 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def info(arguments: argparse.Namespace) -> None:
-    """Print the settings and the contents of a map."""
-    rows = (_info_of_folder if Path(arguments.map).is_dir() else _info_of_file)(arguments.map)
+    """Print the settings and the contents of a map, or what scan files hold and how they are read."""
+    if any(map(_is_scans, arguments.paths)):
+        _info_of_scans(arguments)
+        return
+    if len(arguments.paths) > 1:
+        raise ValueError(f"PATH must be one map or scan files; got {len(arguments.paths)} paths")
+    (path,) = arguments.paths
+    rows = (_info_of_folder if Path(path).is_dir() else _info_of_file)(path)
     if arguments.json:
         print(json.dumps(rows, indent=2))
         return
@@ -182,6 +188,24 @@ def _check_resolution(model: Any, resolution: float) -> None:
             f"--resolution must be at least {extent / MAX_CELLS:.2g} m for a map that spans "
             f"{extent:.1f} m; got {resolution}"
         )
+
+
+def _is_scans(name: str) -> bool:
+    """Whether a path names scans and not a map."""
+    from lardhm_torch.io.scan_files import SCAN_SUFFIXES
+    from lardhm_torch.tiles.manifest import MANIFEST_NAME
+
+    path = Path(name)
+    if path.is_dir():
+        return not (path / MANIFEST_NAME).is_file()
+    return path.suffix.lower() in SCAN_SUFFIXES
+
+
+def _info_of_scans(arguments: argparse.Namespace) -> None:
+    """What readers find in scan files and what they assume, in one line."""
+    arguments.scans = arguments.paths
+    report = describe_scans(arguments)
+    print(json.dumps(report.as_dict(), indent=2) if arguments.json else report)
 
 
 def _info_of_file(path: str) -> dict[str, Any]:

@@ -3,47 +3,111 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
+import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lardhm_torch.io.notes import ScanReport
+    from lardhm_torch.sampling import SamplingConfig
     from lardhm_torch.scans import Scans
 
 
 def read_scans(arguments: argparse.Namespace, dim: int | None = None) -> Scans:
     """The scans named on the command line, without z where ``--dim 2`` or a 2-D map asks for it."""
     from lardhm_torch import load_scans
+    from lardhm_torch.scans import every_scan, thin_rays
 
     scans = load_scans(arguments.scans, **_reading(arguments))
+    scans = thin_rays(every_scan(scans, arguments.every), arguments.voxel)
+    _count_far(scans, arguments)
     return _with_dim(scans, arguments, dim)
 
 
 def iter_scans_of(arguments: argparse.Namespace, dim: int | None = None) -> Iterator[Scans]:
     """The same, one after the other."""
     from lardhm_torch import iter_scans
+    from lardhm_torch.scans import thin_rays
 
-    for scan in iter_scans(arguments.scans, **_reading(arguments)):
-        yield _with_dim(scan, arguments, dim)
+    scans = iter_scans(arguments.scans, **_reading(arguments))
+    for scan in itertools.islice(scans, 0, None, arguments.every):
+        thinned = thin_rays(scan, arguments.voxel)
+        _count_far(thinned, arguments)
+        yield _with_dim(thinned, arguments, dim)
 
 
 def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Iterator[Scans]:
     """The same in pieces of bounded size, for scans larger than memory."""
     from lardhm_torch.io.scan_files import iter_pieces
+    from lardhm_torch.scans import thin_rays
 
+    if arguments.every != 1:
+        raise ValueError("--every is not for tiled maps, which read files in pieces")
+    is_empty = True
     for piece in iter_pieces(arguments.scans, **_reading(arguments)):
-        yield _with_dim(piece, arguments, dim)
+        is_empty = False
+        thinned = thin_rays(piece, arguments.voxel)
+        _count_far(thinned, arguments)
+        yield _with_dim(thinned, arguments, dim)
+    if is_empty:
+        raise ValueError("SCANS must hold at least one usable ray; got none")
+
+
+def describe_scans(arguments: argparse.Namespace) -> ScanReport:
+    """What the readers find in the scans named on the command line, and what they assume."""
+    from lardhm_torch.io.scan_files import iter_pieces
+
+    for _ in iter_pieces(arguments.scans, **_reading(arguments)):
+        pass
+    report: ScanReport = arguments.report
+    arguments.report = None  # the verb prints it itself
+    return report
+
+
+def sampling_of(arguments: argparse.Namespace) -> SamplingConfig:
+    """The sampling with ``--min-range`` and ``--max-range`` put in."""
+    from lardhm_torch import SamplingConfig
+
+    limits = {"min_range": arguments.min_range, "max_range": arguments.max_range}
+    return SamplingConfig(**{name: value for name, value in limits.items() if value is not None})
+
+
+def far_hits(arguments: argparse.Namespace) -> str:
+    """How many hits were lost to ``--max-range``, for the line that a verb ends with."""
+    count = arguments.num_far
+    limit = sampling_of(arguments).max_range
+    return f"; {count} hits beyond {limit:g} m (no hit, free space kept)" if count else ""
+
+
+def _count_far(scans: Scans, arguments: argparse.Namespace) -> None:
+    """Add up the hits beyond the maximum range, for verbs that sample."""
+    if hasattr(arguments, "max_range"):
+        far = scans.is_return & (scans.ranges > sampling_of(arguments).max_range)
+        arguments.num_far += int(far.sum())
 
 
 def _reading(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How the files are to be read."""
+    """How the files are to be read; what is assumed goes into ``arguments.report``."""
+    from lardhm_torch.io.notes import ScanFileWarning, ScanReport
     from lardhm_torch.io.scan_files import Camera
 
+    arguments.report = ScanReport()
+    warnings.simplefilter("ignore", ScanFileWarning)  # the report says it, too
     return {
         "origin": arguments.origin,
         "frame": arguments.frame,
+        "poses_frame": arguments.poses_frame,
+        "sensor_frame": arguments.sensor_frame,
         "topic": arguments.topic,
-        "camera": Camera(intrinsics=arguments.camera, pixel_step=arguments.pixel_step),
+        "camera": Camera(
+            intrinsics=arguments.camera,
+            pixel_step=arguments.pixel_step,
+            depth_scale=arguments.depth_scale,
+        ),
+        "strict": arguments.strict,
+        "report": arguments.report,
     }
 
 
@@ -61,4 +125,4 @@ def report_dropped(dropped: dict[str, int]) -> None:
     """Say on the error stream which rays were left out, and why."""
     for reason, count in dropped.items():
         if count:
-            print(f"{count} rays {reason}", file=sys.stderr)
+            print(f"{count} rays: {reason}", file=sys.stderr)

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from lardhm_torch.cli.outputs import MAP_SUFFIXES, check_folder, check_output
-from lardhm_torch.cli.scan_files import iter_pieces_of
+from lardhm_torch.cli.scan_files import far_hits, iter_pieces_of, sampling_of
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
@@ -21,13 +21,14 @@ def tile(arguments: argparse.Namespace) -> None:
         halo=arguments.halo,
         seed=arguments.seed,
         num_neighbors=arguments.neighbors,
+        sampling=sampling_of(arguments),
     )
     check_folder(arguments.output, arguments.scans)
     ledger = tile_scans(iter_pieces_of(arguments), arguments.output, config, progress=True)
     points = sum(counts.core for counts in ledger.tiles.values())
     print(
         f"{ledger.rays} rays, {points} points -> {len(ledger.cores)} tiles -> {arguments.output}; "
-        f"next: lardhm fit-tiles {arguments.output}"
+        f"next: lardhm fit-tiles {arguments.output}{far_hits(arguments)}"
     )
 
 
@@ -49,6 +50,8 @@ def update_folder(arguments: argparse.Namespace) -> None:
 
     if arguments.output is not None and Path(arguments.output) != Path(arguments.map):
         raise ValueError(f"--output must be omitted: {arguments.map} is updated in place")
+    if arguments.min_range is not None or arguments.max_range is not None:
+        raise ValueError("--min-range and --max-range were fixed by `lardhm tile`; omit them")
     if arguments.clusters is not None or arguments.radius is not None:
         raise ValueError("--clusters and --radius do not apply to tiled maps")
     dim = read_manifest(arguments.map).dim

@@ -16,7 +16,7 @@ class Message(NamedTuple):
 
     topic: str
     kind: str  # "sensor_msgs/PointCloud2"
-    stamp: float  # when it was recorded [s]
+    recorded: int  # when [ns]
     content: memoryview
     is_ros1: bool
 

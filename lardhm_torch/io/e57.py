@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lardhm_torch.io.readout import Readout, whole_numbers
+from lardhm_torch.io.notes import Note
+from lardhm_torch.io.readout import Readout, rows_at_zero, whole_numbers
 from lardhm_torch.io.trajectories import move_points, poses_from_quaternions
 
 _PAGE = 1024  # bytes, the last four of which are a checksum
@@ -17,14 +19,18 @@ _LEAST_BYTES = 2  # of a record: three coordinates take more, and all-equal ones
 _RECORDS_AT_A_TIME = 1 << 16
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_ZEROS = "points at exactly zero are left out (no measurement)"
+_NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
 _IDENTITY = np.eye(4)
 
 
 def read_e57(path: Path) -> Readout:
     """One scan for each entry of data3D that has points, moved by its pose, which is its origin.
 
-    Points that the scanner marked invalid are left out. A field returnIndex gives target_index. A
-    pose that moves nothing is what writers put when they know none: an origin given goes before it.
+    Points that the scanner marked invalid are left out, as are those at exactly zero. Where it
+    marked the range alone as invalid, the beam had no return: it is free up to the longest range
+    of its scan. A field returnIndex gives target_index. Identity poses are what writers put when
+    they know none; a scan without a pose among scans with one has no known origin.
 
     Raises:
         ImportError: pye57 is not installed.
@@ -39,28 +45,47 @@ def read_e57(path: Path) -> Readout:
         raise ImportError(
             f"{path} needs pye57. Install it: pip install 'lardhm_torch[io]'"
         ) from error
-    ends, targets, poses = [], [], []
+    scans, poses = [], []
     with pye57.E57(str(path)) as file:
         for number in range(file.scan_count):
             header = file.get_header(number)
-            columns = _read_columns(file, header, path.stat().st_size)
-            points = _points_of(columns)
-            if len(points):
+            scan = _scan_of(_read_columns(file, header, path.stat().st_size))
+            if len(scan.ends):
                 poses.append(_pose_of(header))
-                ends.append(points if poses[-1] is None else move_points(poses[-1], points))
-                targets.append(columns.get("returnIndex", np.zeros(len(points))))
-    if not ends:
+                pose = poses[-1]
+                scans.append(
+                    scan if pose is None else replace(scan, ends=move_points(pose, scan.ends))
+                )
+    if not scans:
         raise ValueError("at least one point is needed; got none")
-    has_pose = any(pose is not None for pose in poses)
-    filled = np.stack([_IDENTITY if pose is None else pose for pose in poses])
-    return Readout(
-        np.concatenate(ends),
-        filled[:, :3, 3] if has_pose else None,
-        np.repeat(np.arange(len(ends)), [len(points) for points in ends]),
-        target_index=whole_numbers(np.concatenate(targets), "returnIndex", 0, 255) + 1,
-        origin_is_placeholder=bool((filled == _IDENTITY).all()),
-        origin_cure="Export the scans with their poses",
+    counts: dict[str, int] = {}
+    for note in (note for scan in scans for note in scan.notes):
+        counts[note.text] = counts.get(note.text, 0) + (note.count or 0)
+    notes = [Note(text, count, is_loss=text == _ZEROS) for text, count in counts.items()]
+    return _with_poses(
+        Readout(
+            np.concatenate([scan.ends for scan in scans]),
+            is_return=np.concatenate([scan.is_return for scan in scans]),
+            target_index=np.concatenate([scan.target_index for scan in scans]),
+            scan_id=np.repeat(np.arange(len(scans)), [len(scan.ends) for scan in scans]),
+            origin_cure="Export the scans with their poses",
+            notes=tuple(notes),
+        ),
+        poses,
     )
+
+
+def _with_poses(readout: Readout, poses: list[NDArray[np.float64] | None]) -> Readout:
+    """The readout with the position of each scan: NaN where there is no pose."""
+    moving = [pose for pose in poses if pose is not None and (pose != _IDENTITY).any()]
+    known = [pose for pose in poses if pose is not None]
+    if not known or (not moving and len(known) < len(poses)):
+        return readout
+    unknown = np.full((4, 4), np.nan)
+    positions = np.stack([unknown if pose is None else pose for pose in poses])[:, :3, 3]
+    if not moving:
+        return replace(readout, origins=positions, origin_is_placeholder=True)
+    return replace(readout, origins=positions).noting(Note("scanner positions from the poses"))
 
 
 def _check_before_opening(path: Path) -> None:
@@ -100,7 +125,7 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
     capacity = min(count, _RECORDS_AT_A_TIME)
     piece = {name: np.empty(capacity) for name in wanted}
     if not count:
-        return piece
+        return {**piece, "state": np.empty(0)}
     buffers = libe57.VectorSourceDestBuffer()
     for name, values in piece.items():
         buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, capacity, True, True))
@@ -112,8 +137,34 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
     if left:
         raise ValueError(f"{count} points are promised; got {count - left}")
     columns = {name: np.concatenate([part[name] for part in pieces]) for name in wanted}
-    is_valid = columns.pop(state, np.zeros(count)) == 0
-    return {name: values[is_valid] for name, values in columns.items()}
+    columns["state"] = columns.pop(state, np.zeros(count))
+    return columns
+
+
+def _scan_of(columns: dict[str, NDArray[np.float64]]) -> Readout:
+    """The rays of one scan, scanner frame; state 0: a hit, 1: a direction alone, 2: nothing."""
+    state, points = columns["state"], _points_of(columns)
+    is_zero = rows_at_zero(points)
+    is_hit, is_beam = (state == 0) & ~is_zero, (state == 1) & ~is_zero
+    if is_beam.any():
+        ranges = np.linalg.norm(points, axis=1)
+        longest = float(np.nanmax(ranges[is_hit], initial=0.0))
+        is_beam &= longest > 0
+        points[is_beam] *= (longest / ranges[is_beam])[:, None]
+    target = columns.get("returnIndex", np.zeros(len(points)))
+    readout = Readout(
+        points,
+        is_return=is_hit,
+        target_index=whole_numbers(target, "returnIndex", 0, 255) + 1,
+    )
+    kept = is_hit | is_beam
+    readout = readout if kept.all() else readout.select(kept)
+    counts = {
+        _ZEROS: int(((state == 0) & is_zero).sum()),
+        _NO_RETURNS: int(is_beam.sum()),
+        "points marked invalid are left out": int(((state != 0) & ~is_beam).sum()),
+    }
+    return readout.noting(*(Note(text, count) for text, count in counts.items() if count))
 
 
 def _points_of(columns: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import Readout
 
 _BYTES_AT_A_TIME = 1 << 25
 _VLR_BYTES = 54
+_WITHHELD = "points flagged as withheld are left out"
 # LAZ item type -> compressed layers (point, color, color and infrared, wave packet); extra bytes
 # (14) have one each, items of older formats none.
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
@@ -22,17 +25,24 @@ _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 def read_las(path: Path) -> Readout:
     """Coordinates X scale + offset, float64, and the return number of each point.
 
-    A return number of 0, which the format forbids, is what writers leave when they know none: such
-    points count as first returns.
+    Points flagged as withheld are left out. A return number of 0, which the format forbids, is what
+    writers leave when they know none: such points count as first returns.
 
     Raises:
         ImportError: laspy or its LAZ part is not installed.
         ValueError: the header is not one of LAS, or the file is shorter than it says.
     """
     pieces = list(las_pieces(path))
-    ends = np.concatenate([piece.ends for piece in pieces])
     returns = [piece.target_index for piece in pieces if piece.target_index is not None]
-    return replace(pieces[0], ends=ends, target_index=np.concatenate(returns))
+    times = [piece.times for piece in pieces if piece.times is not None]
+    withheld = sum(note.count or 0 for piece in pieces for note in piece.notes)
+    return replace(
+        pieces[0],
+        ends=np.concatenate([piece.ends for piece in pieces]),
+        target_index=np.concatenate(returns),
+        times=np.concatenate(times) if times else None,
+        notes=(Note(_WITHHELD, withheld),) if withheld else (),
+    )
 
 
 def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
@@ -46,16 +56,32 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
     step = max_points or max(1, _BYTES_AT_A_TIME // header.point_bytes)
     # One thread: the parallel reader takes memory by the chunk table's word.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+        reader.header.point_count = header.count
         for points in reader.chunk_iterator(step):
-            ends = np.stack([points.x, points.y, points.z], axis=1).astype(np.float64)
-            got += len(ends)
-            yield Readout(
-                ends,
-                target_index=np.maximum(np.asarray(points.return_number, dtype=np.int64), 1),
-                origin_cure="The format has no place for it: convert to .npz with origins,",
-            )
+            got += len(points)
+            yield _readout_of(points, reader.header.scales)
     if got == 0 or got != header.count:
         raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
+
+
+def _readout_of(points: Any, scales: NDArray[np.float64]) -> Readout:
+    """The points that are not withheld; what lies within half a step of zero is at zero."""
+    ends = np.stack([points.x, points.y, points.z], axis=1).astype(np.float64, copy=False)
+    near = np.abs(ends[:, 0]) < scales[0] / 2
+    for axis in range(1, 3 if near.any() else 1):
+        near &= np.abs(ends[:, axis]) < scales[axis] / 2
+    if near.any():
+        ends[near] = 0
+    has_times = "gps_time" in points.point_format.dimension_names
+    readout = Readout(
+        ends,
+        target_index=np.maximum(np.asarray(points.return_number, dtype=np.int64), 1),
+        origin_cure="Put its trajectory.txt (GPS time, x, y, z a line) or a pose file beside it",
+        times=np.array(points.gps_time, dtype=np.float64) if has_times else None,
+    )
+    withheld = np.asarray(points.withheld).astype(bool)
+    count = int(withheld.sum())
+    return readout.select(~withheld).noting(Note(_WITHHELD, count)) if count else readout
 
 
 def _import_laspy(path: Path) -> Any:
@@ -80,7 +106,8 @@ class _Header:
         self.header_size, self.points_at, self.num_vlrs = struct.unpack_from("<HII", block, 94)
         point_format, self.point_bytes, self.count = struct.unpack_from("<BHI", block, 104)
         if block[25] >= 4:
-            (self.count,) = struct.unpack_from("<Q", block, 247)
+            (count,) = struct.unpack_from("<Q", block, 247)
+            self.count = count or self.count  # some writers fill only the old field
         self.is_compressed = bool(point_format & 0xC0)
         if not self.header_size + self.num_vlrs * _VLR_BYTES <= self.points_at <= size:
             raise ValueError(

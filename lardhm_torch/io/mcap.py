@@ -37,7 +37,7 @@ class _Mcap:
                 raise ValueError(f"a message belongs to channel {number}, which is not described")
             topic, kind, is_ros1 = self.channels[number]
             content = body.take(len(body.content) - body.position)
-            yield Message(topic, kind, 1e-9 * stamp, content, is_ros1)
+            yield Message(topic, kind, stamp, content, is_ros1)
 
 
 def read_mcap(file: BinaryIO, unpack: Unpacker) -> Iterator[Message]:

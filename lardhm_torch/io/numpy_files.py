@@ -145,7 +145,10 @@ def _origins_of(archive: zipfile.ZipFile, has_scan_id: bool) -> NDArray[np.float
         return None
     if not has_scan_id and len(origins) != 1:
         raise ValueError(f"scan_id is needed to choose among {len(origins)} origins; got none")
-    return _coordinates(origins, "origins")
+    origins = _coordinates(origins, "origins")
+    if not np.isfinite(origins).all():
+        raise ValueError(f"origins must be finite; got {origins.tolist()[:3]}")
+    return origins
 
 
 def _checked_entry(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:

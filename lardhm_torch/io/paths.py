@@ -1,11 +1,14 @@
-"""Which files a path stands for, and in which order."""
+"""Which files a path stands for, and in which order; errors that name the file."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 POSE_FILES = ("poses.txt", "groundtruth.txt", "trajectory.txt")
 # Text files that usually lie beside scans and are none.
@@ -75,3 +78,21 @@ def _scans_in(folder: Path, supported: Collection[str]) -> list[Path]:
             f"path must hold at least one scan ({' '.join(sorted(supported))}); {folder} has none"
         )
     return files
+
+
+@contextmanager
+def naming_errors(file: Path) -> Iterator[None]:
+    """A block that reads a file: errors name it."""
+    try:
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN and inf are the sampler's to count
+            yield
+    except ImportError:
+        raise
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise ValueError(f"{file} cannot be read: {error}") from error
+    except Exception as error:
+        # Broken bytes surface from zipfile, zlib, NumPy and laspy under a dozen unrelated types.
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"{file} cannot be read: {reason}") from error

@@ -1,10 +1,11 @@
 """PCD: ascii, binary and binary_compressed; VIEWPOINT is where the sensor stood.
 
-The points of a PCD file are taken to be in the world frame already: VIEWPOINT gives the origin of
-the rays and moves nothing. That is how the published scans with a pose in each header are written
-(la3dm), and what the format's own text asks for: a viewpoint, not a transform. Where points are
-still in the sensor's frame, ``load_scans(path, frame="sensor")`` moves them by VIEWPOINT. The
-header cannot say which beams met nothing; a field ``is_return`` can.
+Whether VIEWPOINT is a viewpoint of points in the world frame (la3dm's published scans) or the
+transform of points in the sensor frame (CloudCompare), no file says. ``frame="world"`` or
+``frame="sensor"`` does; without it a VIEWPOINT that only shifts is taken for a viewpoint, and one
+that rotates is refused (`frames.placed`). VIEWPOINT 0 0 0 1 0 0 0 is what PCL, Open3D and pypcd4
+write when they know no pose. The header cannot say which beams met nothing; a field ``is_return``
+can.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import COLUMN_NAMES, Readout, readout_from_columns
 from lardhm_torch.io.records import (
     Columns,
@@ -36,7 +38,7 @@ _ENTRIES = frozenset(
     | {"WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
 )
 _LZF_RATIO = 88  # three bytes stand for 264 at most
-_NO_VIEWPOINT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+_CURE = "Write the sensor position into VIEWPOINT"
 
 
 @dataclass(frozen=True)
@@ -62,19 +64,27 @@ def read_pcd(path: Path) -> Readout:
         header = _read_header(file)
         readout = readout_from_columns(_read_body(path, file, header))
     if readout.origins is not None or header.viewpoint is None:
-        return replace(readout, origin_cure="Add a line VIEWPOINT to the header")
+        return replace(readout, origin_cure=_CURE)
     position = np.array(header.viewpoint[: readout.dim])
-    return replace(
+    is_placeholder = not any(header.viewpoint[:3]) and _turns_nothing(header.viewpoint)
+    known = replace(
         readout,
         origins=np.tile(position, (readout.num_scans, 1)),
-        world_from_sensor=_pose(header.viewpoint),
-        origin_is_placeholder=header.viewpoint == _NO_VIEWPOINT,
+        world_from_sensor=None if is_placeholder else _pose(header.viewpoint),
+        origin_is_placeholder=is_placeholder,
+        origin_cure=_CURE,
     )
+    return known if is_placeholder else known.noting(Note("sensor position from VIEWPOINT"))
+
+
+def _turns_nothing(viewpoint: list[float]) -> bool:
+    """Whether the quaternion is the identity, or all zeros."""
+    return not any(viewpoint[4:])
 
 
 def _pose(viewpoint: list[float]) -> NDArray[np.float64] | None:
     """(4, 4) world_from_sensor; None where the header gives none, or no rotation."""
-    if viewpoint == _NO_VIEWPOINT or not any(viewpoint[3:]):
+    if not any(viewpoint[3:]):
         return None
     position, (w, x, y, z) = viewpoint[:3], viewpoint[3:]
     return poses_from_quaternions(np.array([position]), np.array([[x, y, z, w]]))[0]
@@ -109,10 +119,14 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
         )
     fields = []
     for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True):
+        number = header_count(count, f"COUNT of field {name}")
+        if name.lower() not in COLUMN_NAMES:  # padding, say; PCL writes it with any type and size
+            width = header_count(size, f"SIZE of field {name}")
+            fields.append(Field(name.lower(), f"V{width}", number))
+            continue
         if kind not in _KINDS or size not in (("4", "8") if kind == "F" else ("1", "2", "4", "8")):
             raise ValueError(f"field {name} has TYPE {kind} and SIZE {size}, which no PCD may have")
-        number = header_count(count, f"COUNT of field {name}")
-        if number < 1 or (number > 1 and name.lower() in COLUMN_NAMES):
+        if number != 1:
             raise ValueError(f"COUNT of field {name} must be 1; got {number}")
         fields.append(Field(name.lower(), f"<{_KINDS[kind]}{size}", number))
     return fields

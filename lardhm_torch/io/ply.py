@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
+from lardhm_torch.io.ply_lists import ListField, read_ascii_lists, read_binary_lists
 from lardhm_torch.io.readout import Readout, readout_from_columns
 from lardhm_torch.io.records import (
     Columns,
@@ -32,8 +33,17 @@ _FORMATS = {
 class _Element:
     name: str
     count: int
-    fields: list[Field] = field(default_factory=list)
-    has_list: bool = False
+    fields: list[Field | ListField] = field(default_factory=list)
+
+    @property
+    def has_list(self) -> bool:
+        """Whether its records may differ in length."""
+        return any(isinstance(entry, ListField) for entry in self.fields)
+
+    @property
+    def plain_fields(self) -> list[Field]:
+        """Its fields without the lists: all of them where it has none."""
+        return [entry for entry in self.fields if isinstance(entry, Field)]
 
 
 @dataclass
@@ -46,8 +56,8 @@ class _Header:
 def read_ply(path: Path) -> Readout:
     """The vertices of a PLY file as ray ends; ox, oy, oz of each vertex as sensor positions.
 
-    Elements before the vertices are skipped unless they are binary lists; what comes after the
-    vertices (faces) is not read.
+    List properties and elements before the vertices are skipped; what comes after the vertices
+    (faces) is not read.
 
     Raises:
         ValueError: the header is not one of PLY, or the file is shorter than it says.
@@ -84,8 +94,10 @@ def _read_header(file: BinaryIO) -> _Header:
                 encoding = name
             case ["element", name, count]:
                 elements.append(_Element(name, header_count(count, f"element {name}")))
-            case ["property", "list", _, _, _] if elements:
-                elements[-1].has_list = True
+            case ["property", "list", counts, kind, name] if elements and _is_list(counts, kind):
+                order = _BYTE_ORDERS[encoding or "ascii"]
+                formats = (order + _FORMATS[counts], order + _FORMATS[kind])
+                elements[-1].fields.append(ListField(name.lower(), *formats))
             case ["property", kind, name] if elements and kind in _FORMATS:
                 format = _BYTE_ORDERS[encoding or "ascii"] + _FORMATS[kind]
                 elements[-1].fields.append(Field(name.lower(), format))
@@ -102,11 +114,12 @@ def _read_vertices(
     for element in header.elements:
         if element.name == "vertex":
             if element.has_list:
-                raise ValueError("vertices with list properties are not supported")
-            if header.encoding == "ascii":
-                yield read_ascii(path, skip_lines, element.fields, element.count, bytes_left(file))
+                yield _read_lists(file, element, skip_lines - header.num_lines, header.encoding)
+            elif header.encoding == "ascii":
+                fields = element.plain_fields
+                yield read_ascii(path, skip_lines, fields, element.count, bytes_left(file))
             else:
-                yield from read_binary(file, element.fields, element.count, max_points)
+                yield from read_binary(file, element.plain_fields, element.count, max_points)
             return
         skip_lines += element.count
         if header.encoding != "ascii":
@@ -115,13 +128,26 @@ def _read_vertices(
     raise ValueError(f"an element vertex is needed; got {found or 'none'}")
 
 
+def _is_list(counts: str, kind: str) -> bool:
+    """Whether a list may have these types: whole numbers count its entries."""
+    return kind in _FORMATS and _FORMATS.get(counts, "f")[0] in "iu"
+
+
+def _read_lists(file: BinaryIO, element: _Element, skip_lines: int, encoding: str) -> Columns:
+    """The named columns of an element with lists, after some lines of elements before it."""
+    if encoding != "ascii":
+        return read_binary_lists(file, element.fields, element.count)
+    for _ in range(skip_lines):
+        file.readline()
+    return read_ascii_lists(file, element.fields, element.count)
+
+
 def _skip_binary(file: BinaryIO, element: _Element) -> None:
     """Go past a binary element."""
     if element.has_list:
-        raise ValueError(
-            f"binary lists before the vertices are not supported; got element {element.name}"
-        )
-    size = element.count * record_size(element.fields)
+        read_binary_lists(file, element.fields, element.count)
+        return
+    size = element.count * record_size(element.plain_fields)
     if size > bytes_left(file):
         raise ValueError(f"element {element.name} needs {size} bytes; got {bytes_left(file)}")
     file.seek(size, 1)

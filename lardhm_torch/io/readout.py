@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lardhm_torch.io.notes import Note
 
 COLUMN_NAMES = frozenset(
     {"x", "y", "z", "ox", "oy", "oz", "scan_id", "is_return", "target_index", "return_number"}
@@ -19,13 +21,15 @@ class Readout:
 
     Args:
         ends: (R, D) float64 ray ends, world frame [m].
-        origins: (S, D) float64 sensor positions [m].
+        origins: (S, D) float64 sensor positions [m]; a row of NaN: not known for this scan.
         scan_id: (R,) int64 index into origins.
         is_return: (R,) bool.
         target_index: (R,) int64, 1 = first return of a pulse.
         world_from_sensor: (4, 4) pose the file carries, which has not moved its points.
         origin_is_placeholder: origins is what writers put when they know no pose.
         origin_cure: how a file of this format can carry its sensor position.
+        notes: what was assumed or left out.
+        times: (R,) float64 when each ray was measured [s], in the clock of the file.
     """
 
     ends: NDArray[np.float64]
@@ -36,6 +40,20 @@ class Readout:
     world_from_sensor: NDArray[np.float64] | None = None
     origin_is_placeholder: bool = False
     origin_cure: str = "Add columns ox oy oz"
+    notes: tuple[Note, ...] = ()
+    times: NDArray[np.float64] | None = None
+
+    def noting(self, *notes: Note) -> Readout:
+        """The same with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def select(self, rays: NDArray) -> Readout:
+        """The given rays (mask or indices), with all origins kept."""
+        columns = ("ends", "scan_id", "is_return", "target_index", "times")
+        values = {name: getattr(self, name) for name in columns}
+        return replace(
+            self, **{name: value[rays] for name, value in values.items() if value is not None}
+        )
 
     @property
     def dim(self) -> int:
@@ -45,14 +63,40 @@ class Readout:
     @property
     def needs_origin(self) -> bool:
         """Whether a sensor position given by the caller has a place here."""
-        return self.origins is None or self.origin_is_placeholder
+        if self.origins is None or self.origin_is_placeholder:
+            return True
+        return bool(np.isnan(self.origins).any())
 
     @property
     def num_scans(self) -> int:
         """Number of scans S."""
+        if self.origins is not None:
+            return len(self.origins)
         if self.scan_id is None or not len(self.scan_id):
             return 1
         return int(self.scan_id.max()) + 1
+
+
+def rows_at_zero(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(R,) whether all coordinates of a point are 0; by columns, which is the fastest."""
+    is_zero = points[:, 0] == 0
+    for axis in range(1, points.shape[1] if is_zero.any() else 1):
+        is_zero &= points[:, axis] == 0
+    return is_zero
+
+
+def without_zeros(readout: Readout) -> Readout:
+    """The readout without points at exactly zero, in the coordinates of the file.
+
+    Many writers put (0, 0, 0) where a beam met nothing or a point was invalid. As hits they would
+    be phantoms; where the sensor is at zero itself, rays without length.
+    """
+    is_zero = rows_at_zero(readout.ends)
+    count = int(is_zero.sum())
+    if not count:
+        return readout
+    note = Note("points at exactly zero are left out (no measurement)", count, is_loss=True)
+    return readout.select(~is_zero).noting(note)
 
 
 def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
@@ -78,6 +122,7 @@ def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
         )
     origins, scan_id = _scans_of_rows(columns, origin_names)
     target = columns.get("target_index", columns.get("return_number"))
+    notes = (Note("sensor positions from columns ox oy oz"),) if origin_names else ()
     is_return = columns.get("is_return")
     return Readout(
         ends,
@@ -85,6 +130,7 @@ def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
         scan_id,
         None if is_return is None else whole_numbers(is_return, "is_return", 0, 1).astype(bool),
         None if target is None else whole_numbers(target, "target_index", 1, 2**31),
+        notes=notes,
     )
 
 

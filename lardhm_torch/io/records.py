@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +120,7 @@ def read_ascii(
 
 
 def read_table(
-    path: Path,
+    path: Path | TextIO,
     skip_lines: int,
     columns: list[int],
     *,
@@ -128,7 +128,7 @@ def read_table(
     max_rows: int | None = None,
     comments: str | None = "#",
 ) -> NDArray[np.float64]:
-    """(R, C) numbers of a text file; blank lines are passed over.
+    """(R, C) numbers of a text file, or of the next lines of an open one; blank lines do not count.
 
     Raises:
         ValueError: a word is no number, or a line is too short.

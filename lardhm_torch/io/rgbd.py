@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import natural_key
-from lardhm_torch.io.poses import find_beside, read_poses
+from lardhm_torch.io.pose_files import read_trajectory
+from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.records import read_table
 from lardhm_torch.io.trajectories import MAX_STAMP_GAP, Trajectory, check_rigid, move_points
 
 _INTRINSICS_FILES = ("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt")
+_LISTS = ("depth.txt", "associations.txt", "associate.txt", "association.txt")
+_TUM_POSES = "groundtruth.txt"
 _MAX_PIXELS = 1 << 25
 _NO_DEPTH = (0, 65535)
 
@@ -30,16 +34,23 @@ class Camera:
         intrinsics: fx, fy, cx, cy of the pinhole [pixels], lens distortion removed; None: a file
             camera-intrinsics.txt beside the images.
         pixel_step: every how many pixels of a row and of a column are read; 1: all of them.
+        depth_scale: units of the images per meter; None: 1000 in the 7-Scenes layout, 5000 in
+            TUM's.
     """
 
     intrinsics: tuple[float, float, float, float] | None = None
     pixel_step: int = 4
+    depth_scale: float | None = None
 
     def __post_init__(self) -> None:
         if self.intrinsics is not None:
             _check_intrinsics(tuple(self.intrinsics), "intrinsics")
         if not isinstance(self.pixel_step, int) or self.pixel_step < 1:
             raise ValueError(f"pixel_step must be 1 pixel or more; got {self.pixel_step!r}")
+        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
+            raise ValueError(
+                f"depth_scale must be > 0 units per meter and finite; got {self.depth_scale}"
+            )
 
 
 @dataclass(frozen=True)
@@ -50,7 +61,7 @@ class _Frame:
 
 def is_rgbd_folder(folder: Path) -> bool:
     """Whether a folder has depth images in a layout that is known."""
-    if (folder / "depth.txt").is_file():
+    if _image_list(folder) is not None:
         return True
     return any(file.name.endswith(".depth.png") for file in folder.iterdir())
 
@@ -61,26 +72,27 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
     | layout | images | depth | poses, camera to world |
     |---|---|---|---|
     | 7-Scenes | frame-000000.depth.png | mm | frame-000000.pose.txt, 4 x 4 |
-    | TUM | as depth.txt lists them, with stamps | 1/5000 m | groundtruth.txt |
+    | TUM | as depth.txt or associations.txt lists them | 1/5000 m | groundtruth.txt |
 
-    A pixel of depth 0 or 65535 has none. Images without a pose are left out, with a warning.
+    A pixel of depth 0 or 65535 has none. Images without a pose are left out, with a warning. A
+    negative fy means that y points up in the images' poses (ICL-NUIM).
 
     Raises:
         ImportError: pillow is not installed.
         ValueError: an image, a pose or the intrinsics cannot be read, or no image has a pose.
     """
-    is_tum = (folder / "depth.txt").is_file()
-    frames, without_pose = _tum_frames(folder) if is_tum else _seven_scenes_frames(folder)
+    image_list = _image_list(folder)
+    if image_list is None:
+        frames, without_pose = _seven_scenes_frames(folder)
+    else:
+        frames, without_pose = _tum_frames(folder, image_list)
     if not frames:
         raise ValueError(f"an image with a pose is needed; got {without_pose} without")
-    if without_pose:
-        warnings.warn(
-            f"{folder}: {without_pose} depth images have no pose and are left out", stacklevel=2
-        )
     intrinsics = camera.intrinsics or _read_intrinsics(folder)
+    scale = camera.depth_scale or (1000 if image_list is None else 5000)
     ends, counts = [], []
     for frame in frames:
-        points = _image_points(frame.image, intrinsics, 5000 if is_tum else 1000, camera.pixel_step)
+        points = _image_points(frame.image, intrinsics, scale, camera.pixel_step)
         ends.append(move_points(frame.pose, points))
         counts.append(len(points))
     if not any(counts):
@@ -89,7 +101,26 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
         np.concatenate(ends),
         origins=np.stack([frame.pose[:3, 3] for frame in frames]),
         scan_id=np.repeat(np.arange(len(frames)), counts),
+        notes=_notes(camera, image_list, without_pose),
     )
+
+
+def _notes(camera: Camera, image_list: Path | None, without_pose: int) -> tuple[Note, ...]:
+    """What was assumed of a folder of images."""
+    layout, scale = ("7-Scenes", 1000) if image_list is None else ("TUM", 5000)
+    notes = [Note("camera poses from " + ("pose files" if image_list is None else _TUM_POSES))]
+    if camera.depth_scale is None:
+        text = f"{scale} depth units per meter, as in the {layout} layout"
+        notes.append(Note(text, cure=f"--depth-scale {scale} confirms it"))
+    if without_pose:
+        text = "depth images have no pose and are left out"
+        notes.append(Note(text, without_pose, is_loss=True))
+    return tuple(notes)
+
+
+def _image_list(folder: Path) -> Path | None:
+    """The file that lists the images of the TUM layout."""
+    return next((folder / name for name in _LISTS if (folder / name).is_file()), None)
 
 
 def _seven_scenes_frames(folder: Path) -> tuple[list[_Frame], int]:
@@ -114,22 +145,21 @@ def _seven_scenes_frames(folder: Path) -> tuple[list[_Frame], int]:
     return frames, len(images) - len(frames)
 
 
-def _tum_frames(folder: Path) -> tuple[list[_Frame], int]:
-    """The images that depth.txt lists, and how many are too far in time from a pose."""
+def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
+    """The images that are listed, and how many are too far in time from a pose."""
     stamps, images = [], []
-    for line in (folder / "depth.txt").read_text(encoding="latin-1").splitlines():
-        words = line.partition("#")[0].split()
-        if not words:
-            continue
-        if len(words) != 2 or not _is_stamp(words[0]) or not _is_inside(words[1]):
-            raise ValueError(f"depth.txt must have a stamp and a file in each line; got {line!r}")
-        stamps.append(float(words[0]))
-        images.append(folder / words[1])
-    source = find_beside(folder / "depth.txt", ("groundtruth.txt",))
-    poses = None if source is None else read_poses(source)
+    for line in image_list.read_text(encoding="latin-1").splitlines():
+        words = line.partition("#")[0].replace(",", " ").split()
+        if words:
+            stamp, name = _depth_entry(words, image_list.name)
+            stamps.append(stamp)
+            images.append(folder / name)
+    source = find_beside(image_list, (_TUM_POSES,))
+    poses = None if source is None else read_trajectory(source)
     if not isinstance(poses, Trajectory) or not len(poses.stamps):
         raise ValueError(
-            "poses are needed beside depth.txt: groundtruth.txt, stamp tx ty tz qx qy qz qw a line"
+            f"poses are needed beside {image_list.name}: {_TUM_POSES}, "
+            "stamp tx ty tz qx qy qz qw a line"
         )
     found, gaps = poses.at(np.array(stamps))
     frames = [
@@ -138,6 +168,22 @@ def _tum_frames(folder: Path) -> tuple[list[_Frame], int]:
         if gap <= MAX_STAMP_GAP
     ]
     return frames, len(images) - len(frames)
+
+
+def _depth_entry(words: list[str], name: str) -> tuple[float, str]:
+    """Stamp and file of the depth image in a line of one or two pairs of them.
+
+    Of two images the one whose path says depth is it, else the first.
+    """
+    pairs = list(zip(words[::2], words[1::2], strict=False))
+    are_pairs = len(words) in (2, 4) and all(_is_stamp(s) and _is_inside(f) for s, f in pairs)
+    if not are_pairs:
+        raise ValueError(
+            f"{name} must have a stamp and a file in each line; got {' '.join(words)!r}"
+        )
+    named = [pair for pair in pairs if "depth" in pair[1].lower()]
+    stamp, image = named[0] if len(named) == 1 else pairs[0]
+    return float(stamp), image
 
 
 def _is_stamp(word: str) -> bool:
@@ -175,14 +221,16 @@ def _read_intrinsics(folder: Path) -> tuple[float, float, float, float]:
 
 
 def _check_intrinsics(values: tuple[Any, ...], name: str) -> tuple[float, float, float, float]:
-    if len(values) != 4 or not all(map(math.isfinite, values)) or min(values[:2]) <= 0:
-        raise ValueError(f"{name} must give fx, fy > 0 and cx, cy [pixels]; got {values}")
+    if len(values) != 4 or not all(map(math.isfinite, values)) or not (values[0] > 0 and values[1]):
+        raise ValueError(
+            f"{name} must give fx, fy > 0 and cx, cy [pixels], or fy < 0 where y points up; got {values}"
+        )
     fx, fy, cx, cy = values
     return fx, fy, cx, cy
 
 
 def _image_points(
-    path: Path, intrinsics: tuple[float, float, float, float], per_meter: int, pixel_step: int
+    path: Path, intrinsics: tuple[float, float, float, float], per_meter: float, pixel_step: int
 ) -> NDArray[np.float64]:
     """(n, 3) points of the pixels with a depth, camera frame: x right, y down, z ahead [m]."""
     depth = _read_depth(path)[::pixel_step, ::pixel_step]

@@ -62,7 +62,7 @@ def _ros1_message(bag: _Ros1, header: dict[str, memoryview], body: memoryview) -
         if number not in bag.topics:
             raise ValueError(f"a message belongs to connection {number}, which is not described")
         seconds, nanoseconds = Packed(header["time"]).unpack("II")
-        yield Message(*bag.topics[number], seconds + 1e-9 * nanoseconds, body, True)
+        yield Message(*bag.topics[number], seconds * 10**9 + nanoseconds, body, True)
 
 
 def _word(file: BinaryIO) -> tuple[int]:

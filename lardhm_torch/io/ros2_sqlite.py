@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from lardhm_torch.io.bag_chunks import Message, Unpacker, common_kind
 
+_LOGS = ("-wal", "-journal")  # what a recorder that was killed leaves beside its database
+
+
+def unmerged_log(path: Path) -> Path | None:
+    """A log beside a database that holds part of its content; None if there is none."""
+    logs = [path.with_name(path.name + ending) for ending in _LOGS]
+    return next((log for log in logs if log.is_file() and log.stat().st_size), None)
+
 
 def read_sqlite(path: Path, unpack: Unpacker) -> Iterator[Message]:
-    """Source: https://github.com/ros2/rosbag2 (rosbag2_storage_sqlite3)."""
+    """All messages; a log that a killed recorder left is merged, in a temporary copy.
+
+    Source: https://github.com/ros2/rosbag2 (rosbag2_storage_sqlite3).
+    """
+    log = unmerged_log(path)
+    if log is None:
+        yield from _read_database(f"{path.absolute().as_uri()}?immutable=1", unpack)
+        return
+    size = path.stat().st_size + 2 * log.stat().st_size
+    with tempfile.TemporaryDirectory() as folder:
+        if size > shutil.disk_usage(folder).free:
+            raise ValueError(
+                f"the recorder was killed and left {log.name}, which must be merged first. "
+                f'Run: sqlite3 {path.name} "PRAGMA wal_checkpoint(TRUNCATE)"'
+            )
+        copy = Path(folder) / "bag.db3"
+        shutil.copyfile(path, copy)
+        shutil.copyfile(log, copy.with_name(copy.name + log.name.removeprefix(path.name)))
+        yield from _read_database(copy.as_uri(), unpack)
+
+
+def _read_database(address: str, unpack: Unpacker) -> Iterator[Message]:
     try:
-        connection = sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)
+        connection = sqlite3.connect(address, uri=True)
         try:
             yield from _sqlite_messages(connection, unpack)
         finally:
@@ -39,4 +70,4 @@ def _sqlite_messages(connection: sqlite3.Connection, unpack: Unpacker) -> Iterat
     for number, stamp, content in rows:
         if number not in topics or not isinstance(stamp, int) or not isinstance(content, bytes):
             raise ValueError(f"a message of topic {number!r} at {stamp!r} is damaged")
-        yield Message(*topics[number], 1e-9 * stamp, unpack(memoryview(content), "", None), False)
+        yield Message(*topics[number], stamp, unpack(memoryview(content), "", None), False)

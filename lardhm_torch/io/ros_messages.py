@@ -1,16 +1,12 @@
-"""The few ROS messages that hold scans and poses, unpacked by rosbags (extra "io")."""
+"""The few ROS messages that hold poses, unpacked by rosbags (extra "io")."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lardhm_torch.io.bag_chunks import Message
 
-CLOUD = "sensor_msgs/PointCloud2"
 TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage")
 POSE_OF = {  # where in a message of this kind the pose is
     "geometry_msgs/PoseStamped": ("pose",),
@@ -18,7 +14,6 @@ POSE_OF = {  # where in a message of this kind the pose is
     "nav_msgs/Odometry": ("pose", "pose"),
     "geometry_msgs/TransformStamped": ("transform",),
 }
-_FLOATS = {7: "f4", 8: "f8"}  # PointField's numbers of FLOAT32 and FLOAT64
 
 
 def message_decoder(path: Path) -> Any:
@@ -60,31 +55,3 @@ def pose_row(pose: Any) -> list[float]:
     at = pose.position if hasattr(pose, "position") else pose.translation
     turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
     return [at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w]
-
-
-def cloud_points(cloud: Any) -> NDArray[np.float64]:
-    """(n, 3) fields x, y, z of a PointCloud2."""
-    fields = {f.name: f for f in cloud.fields if f.name in ("x", "y", "z")}
-    if len(fields) != 3:
-        raise ValueError(f"a cloud needs the fields x, y, z; got {', '.join(fields) or 'none'}")
-    order = ">" if cloud.is_bigendian else "<"
-    columns = []
-    for name in ("x", "y", "z"):
-        if fields[name].datatype not in _FLOATS:
-            raise ValueError(f"field {name} must be float32 or float64; it is neither")
-        kind = np.dtype(order + _FLOATS[fields[name].datatype])
-        row_bytes = cloud.width * cloud.point_step
-        fits = fields[name].offset + kind.itemsize <= cloud.point_step
-        whole = max(row_bytes, cloud.row_step) * (cloud.height - 1) + row_bytes
-        if not fits or (cloud.height * cloud.width and whole > len(cloud.data)):
-            raise ValueError(
-                f"a cloud promises {cloud.height} x {cloud.width} points of {cloud.point_step} "
-                f"bytes; got {len(cloud.data)} bytes"
-            )
-        if not cloud.height * cloud.width:
-            return np.empty((0, 3))
-        strides = (max(row_bytes, cloud.row_step), cloud.point_step)
-        shape = (cloud.height, cloud.width)
-        values = np.ndarray(shape, kind, cloud.data, fields[name].offset, strides)
-        columns.append(values.astype(np.float64).reshape(-1))
-    return np.stack(columns, axis=1)

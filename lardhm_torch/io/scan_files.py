@@ -6,51 +6,57 @@
 | ``.ply`` | properties x y z | properties ox oy oz, poses, or ``origin=`` |
 | ``.pcd`` | fields x y z | VIEWPOINT, poses, or ``origin=`` |
 | ``.xyz .txt .csv`` | columns x y z | columns ox oy oz, poses, or ``origin=`` |
-| ``.las .laz`` | scaled X Y Z | poses, or ``origin=`` |
+| ``.pts``, text with a count line | columns x y z | poses, or ``origin=`` |
+| ``.ptx`` | scanner frame | scanner position of each scan |
+| ``.las .laz`` | scaled X Y Z | poses, a trajectory by GPS time, or ``origin=`` |
 | ``.bin`` (KITTI) | x y z intensity, sensor frame | poses |
 | ``.e57`` | cartesian or spherical, scanner frame | pose of each scan |
-| ``.bag .db3 .mcap``, folder of a ROS 2 bag | PointCloud2, its frame | tf, or a topic of poses |
+| ``.bag .db3 .mcap``, folder of a ROS 2 bag | clouds and laser scans | tf, or a topic of poses |
 | folder of depth images (7-Scenes, TUM) | 16-bit depth, camera frame | pose files |
 
 Poses are a file poses.txt, groundtruth.txt or trajectory.txt beside the scans or one folder up,
-each line in KITTI's or TUM's format (`poses.pose_beside`). Whether the points of a PLY, PCD, text
-or LAS file lie in the world or still in the sensor's frame, no file says: the world is assumed,
-``frame="sensor"`` says the other. The rest is in the readers' docstrings.
+each line in KITTI's, KITTI-360's or TUM's format (`poses.pose_beside`). Whether the points of a
+PLY, PCD, text or LAS file lie in the world or still in the sensor's frame, no file says: the world
+is assumed, ``frame="sensor"`` says the other. The rest is in the readers' docstrings.
 
 Coordinates are float64 from the file on, so UTM loses nothing. Columns named scan_id, is_return
 and target_index (or return_number) are read where a format has named columns. Points that are NaN
-are kept: sampling drops and counts them.
+are kept: sampling drops and counts them. Points at exactly zero are left out and counted: they mark
+beams without return. What was assumed is in a `notes.ScanReport`; docs/formats.md has the table.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.io.bag_scans import is_bag_folder, read_bag
+from lardhm_torch.io.bag_files import is_bag_folder
+from lardhm_torch.io.bag_scans import read_bag
 from lardhm_torch.io.e57 import read_e57
 from lardhm_torch.io.frames import placed
 from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import las_pieces, read_las
+from lardhm_torch.io.moving_sensor import seen_from_track
+from lardhm_torch.io.notes import ScanReport, check_notes, no_ray_left
 from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
-from lardhm_torch.io.paths import POSE_FILES, expand_paths
+from lardhm_torch.io.origins import note_not_finite, scans_from, unused_origin, with_origins
+from lardhm_torch.io.paths import expand_paths, naming_errors
 from lardhm_torch.io.pcd import read_pcd
 from lardhm_torch.io.ply import ply_pieces, read_ply
-from lardhm_torch.io.poses import find_beside
-from lardhm_torch.io.readout import Readout
+from lardhm_torch.io.ptx import read_ptx
+from lardhm_torch.io.readout import Readout, without_zeros
 from lardhm_torch.io.rgbd import Camera, is_rgbd_folder, read_rgbd
 from lardhm_torch.io.text import read_text
 from lardhm_torch.scans import Scans, concatenate_scans
 
 PathLike = str | os.PathLike[str]
 PIECE_RAYS = 1 << 18  # rays of a piece; their samples take about 100 MB
+PACKET_RAYS = 1 << 15  # rays of a moving sensor that are given together as one scan
 
 _READERS: dict[str, Callable[[Path], Readout]] = {
     ".npz": read_npz,
@@ -59,6 +65,8 @@ _READERS: dict[str, Callable[[Path], Readout]] = {
     ".xyz": read_text,
     ".txt": read_text,
     ".csv": read_text,
+    ".pts": read_text,
+    ".ptx": read_ptx,
     ".bin": read_kitti,
     ".las": read_las,
     ".laz": read_las,
@@ -67,6 +75,7 @@ _READERS: dict[str, Callable[[Path], Readout]] = {
     ".db3": read_bag,
     ".mcap": read_bag,
 }
+_MAY_HOLD_ZEROS = (".ply", ".pcd", ".xyz", ".txt", ".csv", ".pts", ".las", ".laz")
 _PIECE_READERS: dict[str, Callable[[Path, int], Iterator[Readout]]] = {
     ".npz": npz_pieces,
     ".ply": ply_pieces,
@@ -74,7 +83,40 @@ _PIECE_READERS: dict[str, Callable[[Path, int], Iterator[Readout]]] = {
     ".laz": las_pieces,
 }
 _POINT_READERS = {**_READERS, ".npz": read_npz_points, ".npy": read_npy}
+SCAN_SUFFIXES = frozenset(_READERS)
+_BAGS = (".bag", ".db3", ".mcap", "a ROS 2 bag")
 _FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rgbd_folder}
+
+
+class _Choice:
+    """How the caller wants files to be read."""
+
+    def __init__(
+        self,
+        origin: Sequence[float] | None,
+        frame: str | None,
+        poses_frame: str | None,
+        sensor_frame: str | None,
+        topic: str | Sequence[str],
+        camera: Camera | None,
+        strict: bool,
+    ) -> None:
+        if frame not in (None, "sensor", "world"):
+            raise ValueError(f'frame must be "sensor", "world" or None; got {frame!r}')
+        self.origin, self.frame, self.poses_frame = origin, frame, poses_frame
+        self.strict = strict
+        topics = (topic,) if isinstance(topic, str) else tuple(topic)
+        self.readers: dict[str, Callable[[Path], Readout]] = {
+            **_READERS,
+            **dict.fromkeys(
+                _BAGS,
+                partial(
+                    read_bag, topics=topics, poses_frame=poses_frame, sensor_frame=sensor_frame
+                ),
+            ),
+            ".bin": partial(read_kitti, poses_frame=poses_frame),
+            "a folder of depth images": partial(read_rgbd, camera=camera or Camera()),
+        }
 
 
 def load_scans(
@@ -82,8 +124,12 @@ def load_scans(
     origin: Sequence[float] | None = None,
     *,
     frame: str | None = None,
+    poses_frame: str | None = None,
+    sensor_frame: str | None = None,
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
+    strict: bool = False,
+    report: ScanReport | None = None,
 ) -> Scans:
     """The scans of one file, of several, or of all scan files of a folder, in order.
 
@@ -93,13 +139,18 @@ def load_scans(
 
     Args:
         path: a file, a folder, or several of them.
-        origin: (D,) sensor position in the world [m] for files that carry none. It also takes the
+        origin: (D,) sensor position in the world [m] for scans that carry none. It also takes the
             place of a VIEWPOINT or pose at zero, which writers put when they know none.
         frame: what the points of PLY, PCD, text and LAS files are in. "sensor": the pose of each
             file (a pose file's, or VIEWPOINT) moves them into the world; "world": a pose file only
             says where the sensor stood; None: as "world", but pose files are not looked for.
+        poses_frame: whose poses a pose file holds, "camera" or "lidar"; of a bag, the frame of tf
+            whose poses the topic of poses holds, if it does not say so.
+        sensor_frame: of a bag, the frame of the sensor where clouds are in another one.
         topic: of a bag's clouds, of its poses, or both; needed if there are several.
         camera: of a folder of depth images.
+        strict: refuse whatever would have to be guessed.
+        report: filled with what was read and what was assumed.
 
     Returns:
         All scans, world frame.
@@ -108,27 +159,29 @@ def load_scans(
         FileNotFoundError: there is no such file or folder.
         ValueError: a file cannot be read, has no sensor position, or is of another dimension.
         ImportError: a file needs an optional library.
+
+    Warns:
+        ScanFileWarning: part of a file was left out.
     """
-    if frame not in (None, "sensor", "world"):
-        raise ValueError(f'frame must be "sensor", "world" or None; got {frame!r}')
-    topics = (topic,) if isinstance(topic, str) else tuple(topic)
-    readers: dict[str, Callable[[Path], Readout]] = {
-        **_READERS,
-        **dict.fromkeys((".bag", ".db3", ".mcap"), partial(read_bag, topics=topics)),
-        "a ROS 2 bag": partial(read_bag, topics=topics),
-        "a folder of depth images": partial(read_rgbd, camera=camera or Camera()),
-    }
+    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
     files = expand_paths(path, _READERS, _kind_of_folder)
-    readouts = [_read(file, readers, frame) for file in files]
+    readouts = [_read(file, choice) for file in files]
     if origin is not None and not any(readout.needs_origin for readout in readouts):
-        raise _origin_error(origin, files)
+        raise unused_origin(origin, files)
     dims = {readout.dim: file for file, readout in zip(files, readouts, strict=True)}
     if len(dims) > 1:
         found = ", ".join(f"{dim} in {file}" for dim, file in sorted(dims.items()))
         raise ValueError(f"path must hold scans of one dimension; got {found}")
-    return concatenate_scans(
-        [_scans_from(readout, file, origin) for file, readout in zip(files, readouts, strict=True)]
+    placeholders = sum(map(_num_placeholders, readouts))
+    scans = concatenate_scans(
+        [
+            _finished(readout, file, choice, placeholders, report)
+            for file, readout in zip(files, readouts, strict=True)
+        ]
     )
+    if not len(scans):
+        raise no_ray_left(files, [note for readout in readouts for note in readout.notes])
+    return scans
 
 
 def iter_scans(
@@ -136,32 +189,49 @@ def iter_scans(
     origin: Sequence[float] | None = None,
     *,
     frame: str | None = None,
+    poses_frame: str | None = None,
+    sensor_frame: str | None = None,
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
+    strict: bool = False,
+    report: ScanReport | None = None,
 ) -> Iterator[Scans]:
     """Read the scans of `load_scans` one at a time.
 
     Each file is read when it is needed, so that a folder of any length needs the memory of one file.
+    The rays of a moving sensor (LAS with a trajectory by GPS time), each with an origin of its own,
+    come in packets of 32,768 in the order of time.
 
     Args:
         path: a file, a folder, or several of them.
         origin: see `load_scans`.
         frame: see `load_scans`.
+        poses_frame: see `load_scans`.
+        sensor_frame: see `load_scans`.
         topic: see `load_scans`.
         camera: see `load_scans`.
+        strict: see `load_scans`.
+        report: see `load_scans`.
 
     Yields:
-        One scan each, as `Scans` with a single origin.
+        One scan each, as `Scans` with a single origin, or one packet of a moving sensor.
 
     Raises:
         FileNotFoundError, ValueError, ImportError: see `load_scans`; raised when the file is read.
+            That no file needs the origin given is raised at the end, unless there is one file only.
     """
-    for file in expand_paths(path, _READERS, _kind_of_folder):
-        scans = load_scans(file, origin, frame=frame, topic=topic, camera=camera)
-        for number in range(scans.num_scans):
-            scan = scans.select(scans.scan_id == number)
-            origins, of_all = scans.origins[number : number + 1], torch.zeros_like(scan.scan_id)
-            yield Scans(origins, scan.ends, of_all, scan.is_return, scan.target_index)
+    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
+    for scans, moves in _scans_of_each_file(path, choice, report, max_rays=None):
+        order = scans.scan_id.argsort(stable=True)
+        counts = scans.scan_id.bincount(minlength=scans.num_scans).tolist()
+        for number, rays in enumerate(order.split(PACKET_RAYS if moves else counts)):
+            scan = scans.select(rays)
+            if moves:
+                used, scan_id = scan.scan_id.unique(return_inverse=True)
+            else:
+                used, scan_id = torch.tensor([number]), torch.zeros_like(scan.scan_id)
+            origins = scans.origins[used]
+            yield Scans(origins, scan.ends, scan_id, scan.is_return, scan.target_index)
 
 
 def iter_pieces(
@@ -169,8 +239,12 @@ def iter_pieces(
     origin: Sequence[float] | None = None,
     *,
     frame: str | None = None,
+    poses_frame: str | None = None,
+    sensor_frame: str | None = None,
     topic: str | Sequence[str] = (),
     camera: Camera | None = None,
+    strict: bool = False,
+    report: ScanReport | None = None,
     max_rays: int = PIECE_RAYS,
 ) -> Iterator[Scans]:
     """All rays of `load_scans` in order, a piece of at most ``max_rays`` at a time.
@@ -178,20 +252,57 @@ def iter_pieces(
     LAS, LAZ, binary PLY and ``.npz`` files are read piece by piece and may be larger than memory;
     of other files one at a time is held.
 
-    Args and errors: as `load_scans`; an error comes when the piece's turn comes.
+    Args and errors: as `iter_scans`; an error comes when the piece's turn comes.
     """
-    for file in expand_paths(path, _READERS, _kind_of_folder):
-        reader = None if file.is_dir() else _PIECE_READERS.get(file.suffix.lower())
-        if reader is None:
-            scans = load_scans(file, origin, frame=frame, topic=topic, camera=camera)
-            for start in range(0, len(scans), max_rays):
-                yield scans.select(torch.arange(start, min(len(scans), start + max_rays)))
-            continue
-        pieces = reader(file, max_rays)
-        while (readout := _next_piece(pieces, file, frame)) is not None:
-            if origin is not None and not readout.needs_origin:
-                raise _origin_error(origin, [file])
-            yield _scans_from(readout, file, origin)
+    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
+    for scans, _ in _scans_of_each_file(path, choice, report, max_rays):
+        for start in range(0, len(scans), max_rays):
+            yield scans.select(torch.arange(start, min(len(scans), start + max_rays)))
+
+
+def _scans_of_each_file(
+    path: PathLike | Sequence[PathLike],
+    choice: _Choice,
+    report: ScanReport | None,
+    max_rays: int | None,
+) -> Iterator[tuple[Scans, bool]]:
+    """The scans of one file after the other, and whether each of their rays has its own origin.
+
+    Some formats come in pieces of max_rays.
+    """
+    files = expand_paths(path, _READERS, _kind_of_folder)
+    origin_is_used, placeholders = choice.origin is None, 0
+    for number, file in enumerate(files):
+        before = placeholders
+        for readout in _pieces(file, choice, max_rays):
+            if readout.needs_origin:
+                origin_is_used = True
+            elif len(files) == 1 and not origin_is_used:
+                raise unused_origin(choice.origin or (), files)
+            placeholders = before + _num_placeholders(readout)
+            if placeholders == 1 and number + 1 < len(files) and choice.origin is None:
+                # The first scan of a drive may stand at zero; if the next does, too, none does.
+                placeholders += _num_placeholders(_read(files[number + 1], choice))
+            scans = _finished(readout, file, choice, placeholders, report)
+            yield scans, readout.times is not None and scans.num_scans > 1
+    if not origin_is_used:
+        raise unused_origin(choice.origin or (), files)
+
+
+def _pieces(file: Path, choice: _Choice, max_rays: int | None) -> Iterator[Readout]:
+    """The readout of a file, in pieces if max_rays is given and the format has a reader for it."""
+    reader = None if file.is_dir() else _PIECE_READERS.get(file.suffix.lower())
+    if reader is None or max_rays is None:
+        yield _read(file, choice)
+        return
+    pieces = reader(file, max_rays)
+    while True:
+        with naming_errors(file):
+            readout = next(pieces, None)
+            if readout is None:
+                return
+            readout = _placed(readout, file, choice)
+        yield readout
 
 
 def save_scans(scans: Scans, path: PathLike) -> None:
@@ -225,7 +336,7 @@ def load_points(path: PathLike) -> Tensor:
         path: the file.
 
     Returns:
-        (N, D) float64 positions [m].
+        (N, D) float64 positions [m]; of a scan file the hits: beams without return have no point.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -236,7 +347,10 @@ def load_points(path: PathLike) -> Tensor:
     if file.is_dir():
         raise ValueError(f"path must be one file of points; {file} is a folder")
     (file,) = expand_paths(file, _POINT_READERS)
-    return torch.from_numpy(_read(file, _POINT_READERS).ends)
+    with naming_errors(file):
+        readout = _POINT_READERS[file.suffix.lower()](file)
+    hits = readout if readout.is_return is None else readout.select(readout.is_return)
+    return torch.from_numpy(hits.ends)
 
 
 def _kind_of_folder(folder: Path) -> str | None:
@@ -244,80 +358,41 @@ def _kind_of_folder(folder: Path) -> str | None:
     return next((kind for kind, is_kind in _FOLDER_KINDS.items() if is_kind(folder)), None)
 
 
-def _read(
-    file: Path, readers: Mapping[str, Callable[[Path], Readout]], frame: str | None = None
-) -> Readout:
+def _read(file: Path, choice: _Choice) -> Readout:
     """One file or folder through its reader; whatever is wrong names it."""
     kind = (_kind_of_folder(file) if file.is_dir() else None) or file.suffix.lower()
-    with _naming(file):
-        readout = readers[kind](file)
-        return readout if frame is None else placed(readout, file, frame)
+    with naming_errors(file):
+        return _placed(choice.readers[kind](file), file, choice)
 
 
-def _next_piece(pieces: Iterator[Readout], file: Path, frame: str | None) -> Readout | None:
-    """The next piece of a file, or None after the last; whatever is wrong names the file."""
-    with _naming(file):
-        readout = next(pieces, None)
-        return readout if readout is None or frame is None else placed(readout, file, frame)
+def _placed(readout: Readout, file: Path, choice: _Choice) -> Readout:
+    """Points in the world frame, as far as it is known which frame they are in."""
+    if file.suffix.lower() in _MAY_HOLD_ZEROS:
+        readout = without_zeros(readout)
+    if choice.origin is None and choice.frame != "sensor":
+        tracked = seen_from_track(readout, file)
+        if tracked is not None:
+            return tracked
+    return placed(readout, file, choice.frame, choice.poses_frame)
 
 
-@contextmanager
-def _naming(file: Path) -> Iterator[None]:
-    """A block that reads a file: errors name it."""
-    try:
-        with np.errstate(invalid="ignore", over="ignore"):  # NaN and inf are the sampler's to count
-            yield
-    except ImportError:
-        raise
-    except OSError as error:
-        if error.filename is not None:
-            raise
-        raise ValueError(f"{file} cannot be read: {error}") from error
-    except Exception as error:
-        # Broken bytes surface from zipfile, zlib, NumPy and laspy under a dozen unrelated types.
-        reason = str(error) or type(error).__name__
-        raise ValueError(f"{file} cannot be read: {reason}") from error
-
-
-def _scans_from(readout: Readout, file: Path, origin: Sequence[float] | None) -> Scans:
-    """The readout as Scans, with origin put in where the file knows no sensor position."""
-    origins = readout.origins
-    if origin is not None and readout.needs_origin:
-        if len(origin) != readout.dim:
-            raise ValueError(
-                f"origin must be ({readout.dim},), as the points of {file}; got {tuple(origin)}"
-            )
-        origins = torch.tensor([tuple(origin)] * readout.num_scans, dtype=torch.float64).numpy()
-    if origins is None:
-        poses = find_beside(file, POSE_FILES)
-        hint = "" if poses is None else f' For {poses.name}: frame="sensor" or frame="world".'
-        raise ValueError(
-            f"{file} must say where the sensor stood, and it does not. {readout.origin_cure} or "
-            f"give it: load_scans(path, origin=(x, y, z)), --origin on the command line.{hint}"
-        )
-    columns = {
-        "origins": origins,
-        "ends": readout.ends,
-        "scan_id": readout.scan_id,
-        "is_return": readout.is_return,
-        "target_index": readout.target_index,
-    }
-    try:
-        scans = Scans(**{k: torch.from_numpy(v) for k, v in columns.items() if v is not None})
-    except ValueError as error:
-        raise ValueError(f"{file} does not hold scans: {error}") from error
-    if not torch.isfinite(scans.origins).all():
-        raise ValueError(f"{file}: origins must be finite; got {scans.origins.tolist()[:3]}")
+def _finished(
+    readout: Readout,
+    file: Path,
+    choice: _Choice,
+    num_placeholders: int,
+    report: ScanReport | None,
+) -> Scans:
+    """The readout as Scans, once its sensor positions are known and its notes accepted."""
+    readout = with_origins(readout, file, choice.origin, num_placeholders)
+    readout = note_not_finite(readout)
+    scans = scans_from(readout, file)
+    check_notes(file, readout.notes, choice.strict)
+    if report is not None:
+        report.add(file, scans, readout.notes)
     return scans
 
 
-def _origin_error(origin: Sequence[float], files: list[Path]) -> ValueError:
-    return ValueError(
-        "origin must be left out when the files carry their own sensor positions; "
-        f"got origin={tuple(origin)} for {_names(files)}"
-    )
-
-
-def _names(files: list[Path]) -> str:
-    """One file by name, several by the first and their number."""
-    return str(files[0]) if len(files) == 1 else f"{files[0]} and {len(files) - 1} more"
+def _num_placeholders(readout: Readout) -> int:
+    """How many scans have a sensor position that is only a placeholder."""
+    return readout.num_scans if readout.origin_is_placeholder else 0

@@ -1,45 +1,135 @@
-"""Text tables: .xyz, .txt, .csv; delimiter and header are detected."""
+"""Text tables: .xyz, .txt, .csv, .pts; delimiter, header and count lines are detected."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import COLUMN_NAMES, Readout, readout_from_columns
 from lardhm_torch.io.records import read_table
 
 _PEEK_BYTES = 65_536
+_COMMENT_MARKS = ("#", "//", "%", ";", "!")
+_UNIT = re.compile(r"[\[(][^\])]*[\])]")  # [m], (m)
+_OTHER_NAMES = {
+    f"{name}{mark}{i}": "xyz"[i] for name in ("points", "coords") for mark in ":_" for i in range(3)
+}
+_OTHER_NAMES |= {"easting": "x", "northing": "y", "east": "x", "north": "y"}
+_OTHER_NAMES |= dict.fromkeys(("height", "elevation", "altitude", "up"), "z")
+_UNIT_ENDING = re.compile(r"(_m|/m)$")
+_POSITION = re.compile(r"(?:pos|position|point|coord|cartesian)_?([xyz])")
+_COUNTED = 3  # a first column that counts so many rows or more is no coordinate
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a table is written.
+
+    Args:
+        delimiter: between two entries; None: spaces.
+        names: of the columns, lower case; of the first ones, if there are more.
+        skip_lines: before the numbers.
+        count: of the points, from a count line; None without one.
+        notes: what was assumed.
+    """
+
+    delimiter: str | None
+    names: list[str]
+    skip_lines: int
+    count: int | None
+    notes: tuple[Note, ...]
 
 
 def read_text(path: Path) -> Readout:
     """Columns x y [z], and where a header names them ox oy oz, scan_id, is_return, target_index.
 
     Values are parted by commas, semicolons, tabs or spaces. The header is the first line, or the
-    last comment (# or //) before the numbers. Without a header the first three columns (or two, if
-    there are no more) are the coordinates, and further ones are not read.
+    last comment (# // % ; or !) that names x and y and fits the columns; units in brackets are passed
+    over. A line with one whole number before the table is its count of points (PTS); the file may
+    hold several such tables, each of them a scan. Without a header the first three columns (or two,
+    if there are no more) are the coordinates, and further ones are not read.
 
     Raises:
-        ValueError: the file is empty or no text, a word is no number, or x or y is missing.
+        ValueError: the file is empty or no text, a word is no number, x or y is missing, a count is
+            not kept, or the first of several unnamed columns only counts the rows.
     """
-    lines = _first_lines(path)
-    is_comment = [line.startswith(("#", "//")) or not line for line in lines]
+    layout = _layout_of(_first_lines(path), path.suffix.lower())
+    wanted = {name: i for i, name in enumerate(layout.names) if name in COLUMN_NAMES}
+    if not {"x", "y"} <= wanted.keys():
+        raise ValueError(f"columns x and y are needed; got {', '.join(layout.names[:12])}")
+    columns = list(wanted.values())
+    if layout.count is not None:
+        return _read_counted(path, layout, wanted)
+    table = read_table(path, layout.skip_lines, columns, delimiter=layout.delimiter)
+    if layout.notes and _counts_rows(table[:, 0]):
+        raise ValueError(
+            "its first column counts the rows, and no header names the columns. Name them in the "
+            "first line, such as: id x y z"
+        )
+    return readout_from_columns({name: table[:, i] for i, name in enumerate(wanted)}).noting(
+        *layout.notes
+    )
+
+
+def _layout_of(lines: list[str], suffix: str) -> _Layout:
+    """Delimiter, names and count from the first lines of a file."""
+    is_comment = [line.startswith(_COMMENT_MARKS) or not line for line in lines]
     num_comments = len(list(takewhile(bool, is_comment)))
     if num_comments == len(lines):
         raise ValueError("a line of numbers is needed; the file has none in its first 64 KiB")
-    first = lines[num_comments]
-    delimiter = next((mark for mark in ";,\t" if mark in first), None)
-    words = _words(first, delimiter)
-    skip_lines = num_comments
-    if not all(map(_is_number, words)):
-        names, skip_lines = words, num_comments + 1
-    else:
-        names = _names_in_comment(lines[:num_comments]) or ["x", "y", "z"][: len(words)]
-    wanted = {name: i for i, name in enumerate(names) if name in COLUMN_NAMES}
-    if not {"x", "y"} <= wanted.keys():
-        raise ValueError(f"columns x and y are needed; got {', '.join(names[:12])}")
-    table = read_table(path, skip_lines, list(wanted.values()), delimiter=delimiter)
-    return readout_from_columns({name: table[:, i] for i, name in enumerate(wanted)})
+    comments, rest = lines[:num_comments], lines[num_comments:]
+    skip_lines, names = num_comments, list[str]()
+    if not all(map(_is_number, _words(rest[0], _delimiter(rest[0])))):
+        delimiter = _delimiter(rest[0])
+        names = [_name(word) for word in _words(_UNIT.sub("", rest[0]), delimiter)]
+        rest, skip_lines = rest[1:], skip_lines + 1
+    count = None
+    if rest and _is_count(rest[0]) and (len(rest) == 1 or len(_entries(rest[1])) > 1):
+        count, rest, skip_lines = int(rest[0]), rest[1:], skip_lines + 1
+    row = rest[0] if rest else ""
+    width = len(_entries(row))
+    notes: tuple[Note, ...] = ()
+    names = names or _names_in_comments(comments, width)
+    if not names:
+        names = ["x", "y", "z"][:width]
+        if width > 3 and suffix not in (".xyz", ".pts"):
+            cure = "name the columns in the first line"
+            notes = (Note("first three columns taken for x y z", cure=cure),)
+    return _Layout(_delimiter(row), names, skip_lines, count, notes)
+
+
+def _read_counted(path: Path, layout: _Layout, wanted: dict[str, int]) -> Readout:
+    """Tables that each have a count line before them, one scan each."""
+    tables, count, skip = list[NDArray[np.float64]](), layout.count, layout.skip_lines
+    size = path.stat().st_size
+    with open(path, encoding="latin-1") as file:
+        for _ in range(skip):
+            file.readline()
+        while count is not None:
+            if 4 * count > size:  # "0 0" and a line break
+                raise ValueError(f"{count} points are promised; {size} bytes are too few")
+            columns = list(wanted.values())
+            table = read_table(file, 0, columns, delimiter=layout.delimiter, max_rows=count)
+            if len(table) != count:
+                raise ValueError(f"{count} points are promised; got {len(table)} lines")
+            tables.append(table)
+            line = next((text for text in iter(file.readline, "") if text.strip()), "")
+            if line and not _is_count(line.strip()):
+                raise ValueError(f"{count} points are promised; more lines follow: {line[:40]!r}")
+            count = int(line) if line else None
+    table = np.concatenate(tables)
+    readout = readout_from_columns({name: table[:, i] for i, name in enumerate(wanted)})
+    if len(tables) == 1 or readout.scan_id is not None:
+        return readout
+    note = Note("tables of points, each taken for a scan", len(tables))
+    scan_id = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    return Readout(readout.ends, scan_id=scan_id, notes=(note,))
 
 
 def _first_lines(path: Path) -> list[str]:
@@ -53,10 +143,25 @@ def _first_lines(path: Path) -> list[str]:
     return lines[:-1] if len(lines) > 1 and (len(start) == _PEEK_BYTES or not lines[-1]) else lines
 
 
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in ";,\t" if mark in line), None)
+
+
 def _words(line: str, delimiter: str | None) -> list[str]:
     """The entries of a line, lower case, without quotes; one empty at the end does not count."""
-    words = [word.strip().strip("\"'").lower() for word in line.split(delimiter)]
+    words = [word.strip().strip("\"'").strip().lower() for word in line.split(delimiter)]
     return words[:-1] if len(words) > 1 and not words[-1] else words
+
+
+def _entries(line: str) -> list[str]:
+    return _words(line, _delimiter(line))
+
+
+def _name(word: str) -> str:
+    """The name of a column as we call it: "points:0" of ParaView, "x_m" and "easting" are x."""
+    word = _UNIT_ENDING.sub("", word)
+    plain = _POSITION.fullmatch(word)
+    return plain[1] if plain else _OTHER_NAMES.get(word, word)
 
 
 def _is_number(word: str) -> bool:
@@ -67,7 +172,28 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _names_in_comment(lines: list[str]) -> list[str]:
-    """Column names of the last comment, if that is what it holds."""
-    words = re.split(r"[\s,;]+", lines[-1].lstrip("#/ \t").lower()) if lines else []
-    return words if {"x", "y"} <= set(words) else []
+def _is_count(line: str) -> bool:
+    return line.isascii() and line.isdigit() and len(line) < 12
+
+
+def _names_in_comments(comments: list[str], width: int) -> list[str]:
+    """Column names of the last comment that has them for all columns, or for the first ones.
+
+    Words before the names do not count ("columns: id x y z"), nor units in brackets. A comment in
+    prose that mentions x and y names nothing.
+    """
+    for line in reversed(comments):
+        plain = _UNIT.sub("", line.lstrip("#/%;! \t")).lower()
+        words = [_name(word.strip("\"':")) for word in re.split(r"[\s,;]+", plain) if word]
+        for names in (words[-width:], words):
+            fits = len(names) == width or (len(names) < width and names[:1] == ["x"])
+            if fits and {"x", "y"} <= set(names):
+                return names
+    return []
+
+
+def _counts_rows(column: NDArray[np.float64]) -> bool:
+    """Whether a column goes up by one with every row, in whole numbers."""
+    if len(column) < _COUNTED or column[0] != np.floor(column[0]):
+        return False
+    return bool((np.diff(column) == 1).all())

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_STAMP_GAP = 0.25  # [s] a pose is no farther than this from the time it is asked for
+STAMP_ROUNDING = 1e-3  # [s] stamps are often written in milliseconds
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,8 @@ class Trajectory:
     def at(self, stamps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(n, 4, 4) poses between the two nearest, and (n,) distances to the nearest stamp [s].
 
-        Positions follow the line, rotations the great circle. Before the first stamp and after the
-        last one the pose stays.
+        Positions are interpolated linearly, rotations along the great circle. Before the first
+        stamp and after the last one the distance is infinite: the motion there is not known.
         """
         from scipy.spatial.transform import Rotation, Slerp
 
@@ -34,6 +35,10 @@ class Trajectory:
         gaps = np.minimum(
             abs(stamps - self.stamps[right]), abs(stamps - self.stamps[(right - 1).clip(min=0)])
         )
+        is_outside = (stamps < self.stamps[0] - STAMP_ROUNDING) | (
+            stamps > self.stamps[-1] + STAMP_ROUNDING
+        )
+        gaps = np.where(is_outside, np.inf, gaps)
         if len(self.stamps) == 1:
             return np.repeat(self.poses, len(stamps), axis=0), gaps
         # From the first stamp on: seconds since 1970 have a quarter of a microsecond left.
@@ -84,11 +89,16 @@ def poses_from_quaternions(
 
 def check_rigid(poses: NDArray[np.float64], name: str) -> None:
     """Raise a ValueError unless all (L, 4, 4) poses are a rotation and a finite position."""
+    rigid = is_rigid(poses)
+    if not rigid.all():
+        raise ValueError(
+            f"{name} must hold rotations and positions; line {int(np.argmin(rigid))} is none"
+        )
+
+
+def is_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(L,) whether each of (L, 4, 4) poses is a rotation and a finite position."""
     rotations = poses[:, :3, :3]
     drift = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    is_rigid = (drift < 1e-3) & (np.linalg.det(rotations) > 0)
-    is_rigid &= np.isfinite(poses).all(axis=(1, 2))
-    if not is_rigid.all():
-        raise ValueError(
-            f"{name} must hold rotations and positions; line {int(np.argmin(is_rigid))} is none"
-        )
+    is_finite = np.isfinite(poses).all(axis=(1, 2))
+    return (drift < 1e-3) & (np.linalg.det(rotations) > 0) & is_finite

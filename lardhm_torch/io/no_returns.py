@@ -1,0 +1,48 @@
+"""Directions of beams that met nothing, from the grid that a scanner measures on."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LARGEST_MISFIT = 0.5  # of a step of the grid
+
+
+def grid_directions(
+    points: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.float64] | None:
+    """(C R, 3) unit vectors of all beams of a grid; None if it is no grid of angles.
+
+    All beams of a column have one azimuth, all of a row one elevation: both are the medians of
+    the points that were measured. Rows of NaN: no beam of that column or row met anything.
+
+    Args:
+        points: (C R, 3), column by column, scanner frame [m]; zero or NaN where nothing was met.
+        shape: columns C and rows R.
+    """
+    grid = np.where((points == 0).all(axis=1)[:, None], np.nan, points).reshape(*shape, 3)
+    x, y, z = np.moveaxis(grid, -1, 0)
+    # Azimuth and elevation over the top: a column of a panorama may hold both halves of a circle.
+    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns and rows without a point
+        middle = np.nanmedian(np.cos(azimuth), axis=1), np.nanmedian(np.sin(azimuth), axis=1)
+        of_column = np.arctan2(middle[1], middle[0])
+        of_row = np.nanmedian(elevation, axis=0)
+        misfit_azimuth = np.angle(np.exp(1j * (azimuth - of_column[:, None])))
+        steps = [np.nanmedian(np.abs(np.diff(np.unwrap(a)))) for a in (of_column, of_row)]
+        misfits = [np.abs(misfit_azimuth), np.abs(elevation - of_row)]
+        fits = [
+            np.nanquantile(misfit, 0.95) < _LARGEST_MISFIT * max(step, 1e-4)
+            for misfit, step in zip(misfits, steps, strict=True)
+        ]
+    if not all(fits):
+        return None
+    flat = np.cos(of_row)
+    directions = np.empty_like(grid)
+    directions[..., 0] = flat * np.cos(of_column)[:, None]
+    directions[..., 1] = flat * np.sin(of_column)[:, None]
+    directions[..., 2] = np.sin(of_row)
+    return directions.reshape(-1, 3)
