@@ -14,22 +14,40 @@ namespace lardhm {
 namespace {
 
 constexpr int kTableBits = 24;                                  // as sampling.TABLE_BITS
+constexpr int kGlanceBits = 22;                                 // 512 KB
 constexpr uint32_t kPrimes[3] = {73856093, 19349669, 83492791};  // as sampling.PRIMES
 constexpr int64_t kRaysPerTask = 256, kPointsPerTask = 8192;
 
-// Two megabytes: nearly all marks are found set, and are then only read.
-class Table {
+// Bits of a power of two of entries; a larger number counts by its low bits.
+class Bits {
   std::vector<std::atomic<uint32_t>> words;
+  uint32_t last;
 
  public:
-  Table() : words(size_t(1) << (kTableBits - 5)) {}
+  explicit Bits(int bits) : words(size_t(1) << (bits - 5)), last((uint32_t(1) << bits) - 1) {}
 
   bool has(uint32_t entry) const {
-    return words[entry >> 5].load(std::memory_order_relaxed) >> (entry & 31) & 1;
+    return words[(entry & last) >> 5].load(std::memory_order_relaxed) >> (entry & 31) & 1;
   }
 
   void mark(uint32_t entry) {
-    if (!has(entry)) words[entry >> 5].fetch_or(1u << (entry & 31), std::memory_order_relaxed);
+    if (!has(entry))
+      words[(entry & last) >> 5].fetch_or(1u << (entry & 31), std::memory_order_relaxed);
+  }
+};
+
+// Rays mark entries that some point has: those are few, and most steps along a ray are over after a
+// glance at a small part of their bits, which nobody writes while rays are followed.
+struct Table {
+  Bits glance{kGlanceBits}, asked{kTableBits}, crossed{kTableBits};
+
+  void ask(uint32_t entry) {
+    glance.mark(entry);
+    asked.mark(entry);
+  }
+
+  void cross(uint32_t entry) {
+    if (asked.has(entry)) crossed.mark(entry);
   }
 };
 
@@ -66,8 +84,11 @@ void march(const int64_t* cell, const float* inside, const float* way, int64_t s
     entry &= kEntries;
     uint32_t entries[kWide];
     std::memcpy(entries, &entry, sizeof(entries));
-    const int count = int(std::min<int64_t>(kWide, steps - step));
-    for (int j = 0; j < count; ++j) table.mark(entries[j]);
+    const int64_t count = steps - step;
+    uint32_t some = 0;
+    for (int j = 0; j < kWide; ++j) some |= uint32_t(table.glance.has(entries[j])) << j;
+    for (some &= existing(0, count); some; some &= some - 1)
+      table.cross(entries[__builtin_ctz(some)]);
   }
 }
 
@@ -94,7 +115,7 @@ void look_up(const int64_t* cells, int64_t n, const Table& table, bool* unmarked
   run_tasks((n + kPointsPerTask - 1) / kPointsPerTask, [&](int64_t task) {
     const int64_t stop = std::min(n, (task + 1) * kPointsPerTask);
     for (int64_t row = task * kPointsPerTask; row < stop; ++row)
-      unmarked[row] = !table.has(entry_of<D>(cells + row * D));
+      unmarked[row] = !table.crossed.has(entry_of<D>(cells + row * D));
   });
 }
 
@@ -124,6 +145,8 @@ Tensor unmarked_cells(const Tensor& given_points, const Tensor& given_cells,
                   in<float>(ways), ways.size(0), cells.size(0) == 1};
   Table table;
   const auto run = [&](auto dim) {
+    for (int64_t row = 0; row < points.size(0); ++row)
+      table.ask(entry_of<dim()>(in<int64_t>(points) + row * dim()));
     march_all<dim()>(rays, table);
     look_up<dim()>(in<int64_t>(points), points.size(0), table, out<bool>(unmarked));
   };
