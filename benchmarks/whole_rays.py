@@ -17,10 +17,10 @@ from pathlib import Path
 import torch
 from accuracy import find_sets
 from conditions import ROOT, conditions, describe, write_json
-from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from scipy.spatial import cKDTree
 
 from lardhm_torch import LardHilbertMap, Scans, load_scans, raycast, sample_rays, split_rays
+from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 
 TOLERANCE = 0.5  # [m] a ray may end so far before or beyond its hit
 GRAZED = 0.2  # [m] from a hit: a ray that ends there early met a real surface

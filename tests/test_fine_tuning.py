@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 
-from lardhm_torch import LardHilbertMap, Samples, TuneConfig, fine_tune
+from lardhm_torch import FitConfig, LardHilbertMap, Samples, TuneConfig, fine_tune
 from lardhm_torch.io.map_files import load_state, save_state
 from lardhm_torch.learning.fine_tuning import LabelledPoints, _hold_out, batches
 from lardhm_torch.sampling import seeded_generator
@@ -22,9 +22,9 @@ def bent_wall(count=2000, seed=0):
     return points, labels
 
 
-def fitted(num_clusters=24):
+def fitted(num_clusters=24, config=None):
     points, labels = bent_wall()
-    return LardHilbertMap(2).fit(points, labels, num_clusters), points, labels
+    return LardHilbertMap(2).fit(points, labels, num_clusters, config=config), points, labels
 
 
 def log_loss(model, points, labels):
@@ -34,7 +34,7 @@ def log_loss(model, points, labels):
 
 
 def test_tuning_lowers_the_loss_on_points_it_has_not_seen():
-    model, points, labels = fitted(num_clusters=8)
+    model, points, labels = fitted(num_clusters=8, config=FitConfig(passes=4))
     unseen = bent_wall(seed=1)
     before = log_loss(model, *unseen)
     losses = fine_tune(model, points, labels)

@@ -81,7 +81,8 @@ def test_a_threshold_that_unknown_space_exceeds_stops_every_ray_at_once(surface)
     origins, directions = random_rays(200, 2)
     plain = raycast(PlainMap.of(model), origins, directions, 20.0, 0.2, 0.1, surface=surface)
     ours = raycast(model, origins, directions, 20.0, 0.2, 0.1, surface=surface)
-    torch.testing.assert_close(ours, plain, rtol=0, atol=1e-6)
+    # 16 bisections of a few steps of 0.1 m leave cells of some 10^-6 m; a rounding error picks one.
+    torch.testing.assert_close(ours, plain, rtol=0, atol=2e-5)
     assert ours.isfinite().any()
 
 
