@@ -245,6 +245,10 @@ def _register() -> None:
     def _(points: Tensor) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.long)
 
+    @library.register_fake("lardhm::unmarked_cells")
+    def _(points: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(points.shape[0], dtype=torch.bool)
+
     @library.register_fake("lardhm::descent")
     def _(indices: Tensor, values: Tensor, labels: Tensor, factors: Tensor, weights: Tensor,
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip

@@ -103,19 +103,6 @@ using KeptFor =
     std::conditional_t<K == 0, SmallestOfAny<I>,
                        std::conditional_t<(K < 8), Smallest<I, K>, SmallestOfEights<I, K>>>;
 
-// A product that is rounded before it is added to anything.
-template <class V>
-inline V rounded(V product) {
-#if defined(__x86_64__)
-  asm("" : "+v"(product));
-#elif defined(__aarch64__)
-  asm("" : "+w"(product));
-#else
-  asm("" : "+m"(product));
-#endif
-  return product;
-}
-
 // Squared distances of the packet to the listed centers (as bits, in `distance`); their k-th
 // smallest, lane by lane. Every step is rounded as in the definition, so that ties are the same.
 template <class T, int D, int K>

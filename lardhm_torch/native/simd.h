@@ -61,6 +61,19 @@ inline V load(const void* from) {
   return v;
 }
 
+// A product that is rounded before it is added to anything.
+template <class V>
+inline V rounded(V product) {
+#if defined(__x86_64__)
+  asm("" : "+v"(product));
+#elif defined(__aarch64__)
+  asm("" : "+w"(product));
+#else
+  asm("" : "+m"(product));
+#endif
+  return product;
+}
+
 // One bit a lane, set where a <= b; lanes are integers of 4 or 8 bytes.
 template <class I>
 inline uint32_t bits_le(I a, I b) {
