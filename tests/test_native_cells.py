@@ -61,7 +61,8 @@ def test_without_rays_or_points_nothing_is_crossed(ops, plain, dim):
     starts, ahead, lengths = make_rays(3, dim, 5.0, False)
     points = points_along(starts, ahead, lengths)
     none = (starts[:0], ahead[:0], lengths[:0], 0.1)
-    assert never_crossed(points, *none).all() and plain(points, *none).all()
+    assert never_crossed(points, *none).all()
+    assert plain(points, *none).all()
     assert never_crossed(points[:0], starts, ahead, lengths, 0.1).shape == (0,)
 
 

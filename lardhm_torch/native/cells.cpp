@@ -1,4 +1,5 @@
-// Which cells of space rays went through: a hash table of one bit a cell, as `sampling.never_crossed`.
+// Which cells of space rays went through: a hash table of one bit a cell, as
+// `sampling.unmarked_cells`.
 
 #include <algorithm>
 #include <atomic>
@@ -71,7 +72,8 @@ inline Unsigned whole_cells(Wide x) {
 // Marks the cells at half a cell, one and a half, ... along a ray from its start: a cell and the
 // place inside it.
 template <int D>
-void march(const int64_t* cell, const float* inside, const float* way, int64_t steps, Table& table) {
+void march(const int64_t* cell, const float* inside, const float* way, int64_t steps,
+           Table& table) {
   Wide lane;
   for (int j = 0; j < kWide; ++j) lane[j] = float(j) + 0.5f;
   for (int64_t step = 0; step < steps; step += kWide) {
@@ -105,7 +107,8 @@ void march_all(const Rays& rays, Table& table) {
     const int64_t stop = std::min(rays.count, (task + 1) * kRaysPerTask);
     for (int64_t ray = task * kRaysPerTask; ray < stop; ++ray) {
       const int64_t start = rays.one_start ? 0 : ray * D;
-      march<D>(rays.cells + start, rays.inside + start, rays.ways + ray * D, rays.steps[ray], table);
+      march<D>(rays.cells + start, rays.inside + start, rays.ways + ray * D, rays.steps[ray],
+               table);
     }
   });
 }
@@ -119,11 +122,13 @@ void look_up(const int64_t* cells, int64_t n, const Table& table, bool* unmarked
   });
 }
 
-void check_rays(const Tensor& cells, const Tensor& inside, const Tensor& ways, const Tensor& steps) {
+void check_rays(const Tensor& cells, const Tensor& inside, const Tensor& ways,
+                const Tensor& steps) {
   check(cells.scalar_type() == ScalarType::Long && steps.scalar_type() == ScalarType::Long &&
             inside.scalar_type() == ScalarType::Float && ways.scalar_type() == ScalarType::Float,
         "cells and steps must be int64, places in cells and ways float32");
-  check(ways.dim() == 2 && (ways.size(1) == 2 || ways.size(1) == 3), "ways must be (R, 2) or (R, 3)");
+  check(ways.dim() == 2 && (ways.size(1) == 2 || ways.size(1) == 3),
+        "ways must be (R, 2) or (R, 3)");
   const int64_t rays = ways.size(0), dim = ways.size(1);
   check(cells.dim() == 2 && cells.size(1) == dim && inside.dim() == 2 && inside.size(1) == dim &&
             inside.size(0) == cells.size(0) && (cells.size(0) == 1 || cells.size(0) == rays),
