@@ -1,9 +1,9 @@
-"""One more scan into a map: Algorithm 2, and a default under which the map stops growing.
+"""Incremental update with one more scan: Algorithm 2, and a default rule with bounded growth.
 
-Algorithm 2 clusters the new points and merges new clusters with old ones. Two partitions of one
-surface rarely put their centers within one standard deviation of each other, so a map grows with
-every visit. By default new points therefore go straight into the clusters of their class that
-explain them, and only the others are clustered.
+Algorithm 2 clusters the new points and merges new clusters with old ones. Two independent partitions
+of a surface rarely have centers within one standard deviation of each other, so the map grows with
+every scan of the same place. By default, new points are therefore assigned directly to nearby clusters
+of their class, and only the remaining points are clustered.
 """
 
 from __future__ import annotations
@@ -48,28 +48,28 @@ from lardhm_torch.learning.replay import (
 )
 from lardhm_torch.points import in_morton_order
 
-COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
-SMOOTHER = 2.0  # free space than surfaces: so many times the points before a cluster is too coarse
-REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
-LOOKED_AT = 4  # times as many points may contradict old clusters as train the weights
-# The map recalls its own leaning to hits, so that new points need no more of it.
+COVERED = 0.36  # a scan covers a cluster if its points have this fraction of the variance
+SMOOTHER = 2.0  # factor on `UpdateConfig.crowded` for free clusters, which may be coarser
+REACH = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
+LOOKED_AT = 4  # number of free points checked for contradictions, relative to max_points
+# Pseudo-samples already contain the class weight of `fit`, so the classes get equal weights here.
 UPDATE_FIT = FitConfig(batch_size=1024, l2=0.01, occupied_share=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateConfig:
-    """How a new scan enters a map. Radii are in standard deviations of a cluster."""
+    """Settings of an incremental update. Radii are in standard deviations of a cluster."""
 
-    as_in_paper: bool = False  # cluster all new points and merge by Algorithm 2
-    zeta: float = 1.0  # [m] of Algorithm 2: clusters farther apart never merge
-    radius: float = 3.0  # a point this near to the nearest center of its class joins the cluster
-    reach: float = 4.0  # nearer points make no new cluster
-    fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
-    refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
-    crowded: float = 8.0  # in that, a past counts at most so many times the usual points
-    max_points: int = 20_000  # that train the weights, at random; all points enter the clusters
-    replay: int = 8  # points recalled from an old cluster; 0: train on new points only
-    memory: float = 800.0  # a cluster's past counts at most as many points: the world may change
+    as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
+    zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
+    radius: float = 3.0  # points within it of the nearest center of their class join the cluster
+    reach: float = 4.0  # only points beyond it form new clusters
+    fringe: float = 2.0  # new clusters with an old center within it are discarded
+    refine: float = 1.3  # clusters whose ratio of new to old points exceeds this are split
+    crowded: float = 8.0  # for that rule, the old count is capped at this times the usual count
+    max_points: int = 20_000  # random points used to train the weights; clusters use all points
+    replay: int = 8  # pseudo-samples per old cluster; 0: train on new points only
+    memory: float = 800.0  # upper bound on the weight of the old points of a cluster
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
@@ -93,7 +93,7 @@ class UpdateConfig:
 
 
 class Task(NamedTuple):
-    """What every step of an update needs beside clusters and points."""
+    """Settings and random generator of an update."""
 
     kernel: Kernel
     config: UpdateConfig
@@ -103,21 +103,22 @@ class Task(NamedTuple):
 def updated(
     state: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
 ) -> tuple[Tensor, MapState]:
-    """One more scan: clusters pooled or appended, weights trained.
+    """Update clusters and weights with one more scan.
 
-    Only clusters near the points are read, so that the cost does not grow with the map. Old
-    clusters keep their rows; new ones come after them.
+    Only clusters near the points are processed, so the cost does not grow with the map. Existing
+    clusters keep their rows, and new clusters are appended.
 
     Args:
         state: M clusters.
         points: (N, D) new positions, map frame [m].
         labels: (N,) 1 occupied, 0 free.
-        num_clusters: total over both classes if no point were explained yet; None: from the data.
-        task: kernel, settings, random state.
+        num_clusters: total over both classes for a scan of an unmapped place; None: chosen from the
+            data.
+        task: kernel, settings, random generator.
 
     Returns:
-        ((Q,) rows of the clusters near the points; what becomes of them, in that order, and after
-        them the new clusters).
+        (Q,) rows of the clusters near the points; and the updated clusters in that order, followed
+        by the new clusters.
 
     Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
     """
@@ -140,7 +141,7 @@ def updated(
 def _grown(
     known: MapState, classes: list[Tensor], num_clusters: int | None, task: Task
 ) -> tuple[MapState, Tensor]:
-    """(Known clusters with the new points pooled into them, and new ones; which known ones were hit)."""
+    """Known clusters pooled with new points, followed by new clusters; and a mask of those hit."""
     if num_clusters is None:
         totals = scan_clusters(classes)
     else:
@@ -156,14 +157,14 @@ def _grown(
 def _train(
     part: MapState, known: MapState, classes: list[Tensor], hit: Tensor, task: Task
 ) -> MapState:
-    """Weights trained on the new points and on what the clusters around them recall.
+    """Train the weights on the new points and on pseudo-samples of nearby clusters.
 
     Args:
-        part: what the clusters nearby become, new ones at the end.
-        known: what they were.
-        classes: occupied and free new points [m].
-        hit: (Q,) which known clusters hits fell into.
-        task: kernel, settings, random state.
+        part: updated clusters near the scan, followed by new ones.
+        known: Q clusters near the scan, before the update.
+        classes: (N, D) occupied and (F, D) free new points [m].
+        hit: (Q,) bool, known clusters that contain new hits.
+        task: kernel, settings, random generator.
     """
     config, kernel, rng = task.config, task.kernel, task.rng
     index = native.build_index(part.centers, kernel.num_neighbors)
@@ -190,17 +191,19 @@ def _train(
 def absorb(
     part: MapState, points: Tensor, is_occupied: bool, num_clusters: int, task: Task
 ) -> tuple[MapState, Tensor]:
-    """Points of one class pooled into the clusters that explain them; the others make new ones.
+    """Assign points of one class to nearby clusters; cluster the remaining points.
 
     Args:
-        part: clusters nearby, of both classes.
+        part: clusters near the scan, of both classes.
         points: (N, D) new points of one class [m].
-        is_occupied: which class.
-        num_clusters: how many all the points would make; the unexplained make their share.
-        task: kernel, settings, random state.
+        is_occupied: class of the points.
+        num_clusters: number of clusters for all points; reduced in proportion to the points that
+            remain.
+        task: kernel, settings, random generator.
 
     Returns:
-        (what becomes of ``part``, new clusters at its end; rows of those that points fell into).
+        Updated clusters ``part``, followed by new ones; and the rows of clusters that contain new
+        points.
     """
     floor = task.kernel.min_lengthscale
     own = (part.is_occupied == is_occupied).nonzero().squeeze(1)
@@ -220,11 +223,11 @@ def absorb(
 
 
 class _Look(NamedTuple):
-    """What known clusters make of new points.
+    """Assignment of new points to known clusters.
 
-    ``found`` are the moments of the points that join each cluster; ``outgrown`` are the clusters
-    that are too coarse for the scan, and ``covered`` those among them that the scan saw whole;
-    ``rest`` are the points of the outgrown clusters, and those that no cluster explains.
+    ``found`` holds the moments of the points that join each cluster. ``outgrown`` masks the clusters
+    that are too coarse for the scan, and ``covered`` those of them that the scan covers completely.
+    ``rest`` holds the points of the outgrown clusters, and the points without a nearby cluster.
     """
 
     rest: Tensor
@@ -239,7 +242,7 @@ def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) ->
         return _Look(points, clusters, known.is_occupied, known.is_occupied)
     rule = (task.kernel.min_lengthscale, config.radius, config.reach)
     owners, found = explain(points, clusters, *rule)
-    # many scans that each see a little more of a cluster must not hide that it has become too coarse
+    # Cap the count, so that a cluster that grew over many scans can still be found to be too coarse.
     most = config.crowded if bool(known.is_occupied[0]) else SMOOTHER * config.crowded
     past = clusters.counts.clamp(2 * usual_count, most * usual_count)
     outgrown = found.counts > config.refine * past
@@ -249,17 +252,17 @@ def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) ->
 
 
 def _spread(clusters: Clusters) -> Tensor:
-    """(M,) total variance [m^2]."""
+    """(M,) total variance of each cluster [m^2]."""
     total = clusters.scatters.diagonal(dim1=1, dim2=2).sum(dim=1)
     return total / clusters.counts.clamp(min=1)
 
 
 def _settle(known: MapState, new: Clusters, look: _Look, task: Task) -> tuple[Clusters, Tensor]:
-    """Which new clusters are taken, in which order, and the rows that the first of them take over.
+    """Select and order the new clusters, and return the rows that the first of them replace.
 
-    A new cluster that has an old center among its own points is the fringe of old ones and is left
-    out. The new clusters of a covered one share its points in proportion to their own, and one of
-    them takes over its row.
+    A new cluster close to an old center lies at the boundary of an old cluster and is discarded. The
+    count of a covered cluster is distributed among its new clusters in proportion to their counts,
+    and one of them replaces its row.
     """
     none = known.counts[:0]
     if len(known) == 0:
