@@ -97,9 +97,9 @@ def _plain_nearest(points: Tensor, centers: Tensor, num_neighbors: int) -> Tenso
             candidates = _torch_cluster_candidates(points, centers, k + SPARE_CANDIDATES)
     if candidates is None:
         return _exhaustive_nearest(points, centers, k)
-    indices, settled = _closest_candidates(points, centers, candidates, k)
-    if not bool(settled.all()):
-        indices[~settled] = _exhaustive_nearest(points[~settled], centers, k)
+    indices, exact = _closest_candidates(points, centers, candidates, k)
+    if not bool(exact.all()):
+        indices[~exact] = _exhaustive_nearest(points[~exact], centers, k)
     return indices
 
 
@@ -136,8 +136,8 @@ def _closest_candidates(
     distances = squared_distances(points[:, None], centers[candidates])
     order = distances.sort(dim=1, stable=True)
     chosen = candidates.gather(1, order.indices[:, :k]).sort(dim=1).values
-    settled = order.values[:, k - 1] * (1 + 1e-5) < order.values[:, -1]
-    return chosen, settled
+    exact = order.values[:, k - 1] * (1 + 1e-5) < order.values[:, -1]
+    return chosen, exact
 
 
 def _exhaustive_nearest(points: Tensor, centers: Tensor, k: int) -> Tensor:

@@ -92,7 +92,7 @@ class LardHilbertMap(parameters.MapParameters):
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
         mean, variance = self._posterior(points)
-        return posterior.moderate(mean, posterior.OWN_SHARE * variance)
+        return posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance)
 
     @torch.no_grad()
     def unknown(self, points: TensorLike) -> Tensor:

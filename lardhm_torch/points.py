@@ -14,8 +14,10 @@ from lardhm_torch import native
 from lardhm_torch.maps import TensorLike, to_tensor
 
 CHECK_CHUNK = 1 << 18  # number of labels checked at a time, to limit memory
-STRAY = 100.0  # outlier threshold, as a multiple of the spread of the middle 98 % of points
-STRAY_SAMPLE = 1 << 14  # number of points used to estimate the spread
+OUTLIER_FACTOR = (
+    100.0  # outlier threshold, as a multiple of the spread of the middle 98 % of points
+)
+OUTLIER_SAMPLE = 1 << 14  # number of points used to estimate the spread
 UNKNOWN = 0.5  # label of points in unobserved space
 FRAME_CHUNK = 1 << 14  # number of points converted at a time; a chunk fits into the CPU cache
 
@@ -49,16 +51,16 @@ def training_points(
     labels = labels.to(like.dtype)
     if origin is not None:
         return TrainingPoints(to_map_frame(points, origin, like.dtype), labels, origin)
-    points, labels = _drop_strays(points, labels)
+    points, labels = _drop_outliers(points, labels)
     origin = points.mean(dim=0, dtype=torch.float64).round()
     local = to_map_frame(points, origin, like.dtype)
     local, labels = in_morton_order(local, labels)
     return TrainingPoints(local, labels, origin)
 
 
-def _drop_strays(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+def _drop_outliers(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Remove outliers. Warn if there are outliers, or if no point is occupied."""
-    kept = _without_strays(points)
+    kept = _inliers(points)
     if not bool(kept.all()):
         warnings.warn(
             f"left out {int((~kept).sum())} of {len(points)} points that are far from all others; "
@@ -75,21 +77,21 @@ def _drop_strays(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     return points, labels
 
 
-def _without_strays(points: Tensor) -> Tensor:
+def _inliers(points: Tensor) -> Tensor:
     """(N,) mask that is False for outliers, which would degrade the Morton order of all other points.
 
-    A point is an outlier if, along any axis, it is farther from the median than `STRAY` times the
-    spread of the middle 98 % of the points.
+    A point is an outlier if, along any axis, it is farther from the median than `OUTLIER_FACTOR`
+    times the spread of the middle 98 % of the points.
 
     Args:
         points: (N, D) positions [m], finite.
     """
-    every = points[:: max(1, len(points) // STRAY_SAMPLE)].double()
-    low, middle, high = every.quantile(every.new_tensor([0.01, 0.5, 0.99]), dim=0)
-    reach = STRAY * (high - low).max()
-    if not bool(reach > 0):
+    subset = points[:: max(1, len(points) // OUTLIER_SAMPLE)].double()
+    low, middle, high = subset.quantile(subset.new_tensor([0.01, 0.5, 0.99]), dim=0)
+    limit = OUTLIER_FACTOR * (high - low).max()
+    if not bool(limit > 0):
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
-    low, high = (middle - reach).to(points), (middle + reach).to(points)
+    low, high = (middle - limit).to(points), (middle + limit).to(points)
     lower, upper = points.aminmax(dim=0)
     if bool((lower >= low).all()) and bool((upper <= high).all()):  # the common case
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
@@ -131,10 +133,10 @@ def check_samples(
             f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
             f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
         )
-    strange = next((c for c in labels.split(CHECK_CHUNK) if not _are_labels(c)), None)
-    if strange is not None:
-        wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
-        value = strange[wrong][0].item()
+    invalid = next((c for c in labels.split(CHECK_CHUNK) if not _are_labels(c)), None)
+    if invalid is not None:
+        wrong = (invalid != 0) & (invalid != 1) & (invalid != UNKNOWN)
+        value = invalid[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
         raise ValueError(f"labels must be 0 or 1; got {value}. 1/2 means unknown.{cure}")
     known = labels != UNKNOWN

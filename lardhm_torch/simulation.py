@@ -123,9 +123,9 @@ def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) ->
         raise ValueError(f"noise must be >= 0 m; got {noise}")
     rng = torch.Generator().manual_seed(seed)
     origins = torch.tensor(SCANNERS, dtype=torch.float64)
-    shares = [(num_rays + i) // len(SCANNERS) for i in range(len(SCANNERS))]
-    scan_id = torch.repeat_interleave(torch.arange(len(SCANNERS)), torch.tensor(shares))
-    directions = torch.cat([_spiral(share, rng) for share in shares])
+    counts = [(num_rays + i) // len(SCANNERS) for i in range(len(SCANNERS))]
+    scan_id = torch.repeat_interleave(torch.arange(len(SCANNERS)), torch.tensor(counts))
+    directions = torch.cat([_spiral(count, rng) for count in counts])
     ranges = true_ranges(origins[scan_id], directions)
     is_return = ranges.isfinite()
     error = noise * torch.randn(num_rays, generator=rng, dtype=torch.float64)

@@ -178,7 +178,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
             sampling = replace(sampling, behind_samples=0)
         samples = sample_rays(scan, sampling, seed=seed)
     except NoUsableRayError as error:
-        warnings.warn(f"scan {number} was passed over: no usable ray; {error}", stacklevel=3)
+        warnings.warn(f"scan {number} was skipped: no usable ray; {error}", stacklevel=3)
         return
     num_clusters = _num_clusters(samples, config)
     model.update(samples.points, samples.labels, num_clusters, seed=seed, config=config.update)
@@ -190,6 +190,6 @@ def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
     if config.max_clusters is None:
         return config.num_clusters
     *classes, unknown = split_labels(samples.points, samples.labels)
-    shares = 2 if len(unknown) else 1  # with unknown points, the free class gets twice as many
-    chosen = config.num_clusters or shares * sum(scan_clusters(classes))
+    factor = 2 if len(unknown) else 1  # with unknown points, the free class gets twice as many
+    chosen = config.num_clusters or factor * sum(scan_clusters(classes))
     return config.num_clusters if chosen <= config.max_clusters else config.max_clusters

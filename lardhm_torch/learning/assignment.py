@@ -7,11 +7,11 @@ from torch import Tensor
 
 from lardhm_torch import features, native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.clustering import Clusters, clusters_about, points_where
+from lardhm_torch.learning.clustering import Clusters, clusters_from_moments, points_where
 from lardhm_torch.learning.map_state import factor_covariances
 
 
-def reaching(
+def kernels_near(
     centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, points: Tensor, stds: float
 ) -> Tensor:
     """Mask of the kernels whose bounding boxes intersect the bounding box of the points.
@@ -31,8 +31,8 @@ def reaching(
         return torch.ops.lardhm.reaching(*given, stds, *kernel[1:])
     lower, upper = points.aminmax(dim=0)
     factors = features.kernel_factors(raw_scale_tril, kernel)
-    reach = stds * torch.linalg.vector_norm(factors, dim=2)
-    return ((centers + reach >= lower) & (centers - reach <= upper)).all(dim=1)
+    half_width = stds * torch.linalg.vector_norm(factors, dim=2)
+    return ((centers + half_width >= lower) & (centers - half_width <= upper)).all(dim=1)
 
 
 def explain(
@@ -74,11 +74,11 @@ def explain(
         moments[0].index_add_(0, owner, torch.ones_like(offset[:, 0]))
         moments[1].index_add_(0, owner, offset)
         moments[2].index_add_(0, owner, offset[:, :, None] * offset[:, None])
-    found = clusters_about(centers.double(), *moments)
+    found = clusters_from_moments(centers.double(), *moments)
     return owners, Clusters(found.counts, found.means.to(centers), found.scatters.to(centers))
 
 
-def possibly_inside(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
+def inside_candidates(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
     """(P, D) candidate points that may lie inside some cluster, in order.
 
     This fast prefilter keeps all points that lie inside a cluster, and possibly others.

@@ -81,7 +81,7 @@ def cluster_points(
     centers = mini_batch_kmeans(points, num_clusters, rng, iterations=iterations)
     _, counts, sums, scatters = native.assign(points, centers)
     min_count = min(MIN_COUNT, max(1, len(points) // num_clusters))
-    clusters = merge_small(clusters_about(centers, counts, sums, scatters), min_count)
+    clusters = merge_small(clusters_from_moments(centers, counts, sums, scatters), min_count)
     # Clusters that are close in space are close in memory, so queries of large maps are faster.
     order = morton_order(clusters.means)
     return Clusters(*(moments[order] for moments in clusters))
@@ -89,10 +89,10 @@ def cluster_points(
 
 def most_clusters(num_points: int) -> int:
     """Maximum number of clusters of a class: one per `MIN_COUNT` points, or per point if few."""
-    return max(num_points // MIN_COUNT, _few(num_points))
+    return max(num_points // MIN_COUNT, _max_singletons(num_points))
 
 
-def _few(num_points: int) -> int:
+def _max_singletons(num_points: int) -> int:
     """Number of clusters that may be smaller than `MIN_COUNT`; 0 from 2 `FEW_POINTS` points on."""
     return max(0, min(num_points, 2 * FEW_POINTS - num_points))
 
@@ -114,13 +114,13 @@ def cluster_classes(
     classes = split_labels(points, labels)
     if num_clusters is None:
         chosen = choose_num_clusters(next(members for members in classes if len(members)))
-        totals = [chosen * share for share in class_shares(len(classes[2]))]
+        totals = [chosen * ratio for ratio in class_ratios(len(classes[2]))]
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
     return cluster_each(classes, totals, rng)
 
 
-def class_shares(num_unknown: int) -> tuple[int, int, int]:
+def class_ratios(num_unknown: int) -> tuple[int, int, int]:
     """Relative numbers of clusters of occupied, free and unknown points.
 
     With unknown points, free space gets twice as many clusters, because it must end where unknown
@@ -146,7 +146,7 @@ def cluster_each(
     for number, (members, total) in enumerate(zip(classes, totals, strict=True)):
         if len(members) and total:
             found = cluster_points(members, total, rng, rest if number else ITERATIONS)
-            parts.append(of_unknown(found) if number == 2 else found)
+            parts.append(unknown_clusters(found) if number == 2 else found)
     clusters = concatenate_clusters(parts)
     is_occupied = torch.zeros_like(clusters.counts, dtype=torch.bool)
     is_occupied[: len(parts[0]) if len(classes[0]) else 0] = True
@@ -169,7 +169,7 @@ def split_labels(points: Tensor, labels: Tensor) -> list[Tensor]:
     return [occupied, points_where(points, labels < 0.5), points_where(points, labels == 0.5)]
 
 
-def of_unknown(clusters: Clusters) -> Clusters:
+def unknown_clusters(clusters: Clusters) -> Clusters:
     """The same clusters with count 0 and their covariances as scatters, for unknown points.
 
     They do not contribute to the counts and means of clusters that they are pooled with.
@@ -190,17 +190,17 @@ def concatenate_clusters(parts: list[Clusters]) -> Clusters:
 def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
     """Number of clusters of the occupied, the free and, if given, the unknown class.
 
-    The total is divided in the ratio of `class_shares`, rounded in favor of the occupied class. If a
+    The total is divided in the ratio of `class_ratios`, rounded in favor of the occupied class. If a
     class has too few points (see `most_clusters`), the remainder goes to the other classes.
     """
-    room = [most_clusters(size) for size in class_sizes]
-    num_unknown = room[2] if len(room) > 2 else 0
-    shares = class_shares(num_unknown)
-    unknown = min(num_unknown, num_clusters * shares[2] // sum(shares))
+    most = [most_clusters(size) for size in class_sizes]
+    num_unknown = most[2] if len(most) > 2 else 0
+    ratios = class_ratios(num_unknown)
+    unknown = min(num_unknown, num_clusters * ratios[2] // sum(ratios))
     known = num_clusters - unknown
-    fair = -(-known * shares[0] // (shares[0] + shares[1]))
-    occupied = min(room[0], max(fair, known - room[1]))
-    return [occupied, min(room[1], known - occupied), unknown][: len(room)]
+    target = -(-known * ratios[0] // (ratios[0] + ratios[1]))
+    occupied = min(most[0], max(target, known - most[1]))
+    return [occupied, min(most[1], known - occupied), unknown][: len(most)]
 
 
 def scan_clusters(classes: list[Tensor]) -> list[int]:
@@ -214,8 +214,8 @@ def scan_clusters(classes: list[Tensor]) -> list[int]:
         classes: (N, D) occupied and (F, D) free positions [m].
     """
     chosen = choose_num_clusters(classes[0] if len(classes[0]) else classes[1], fine=True)
-    rooms = [most_clusters(len(members)) for members in classes]
-    return [min(chosen, room) for room in rooms]
+    limits = [most_clusters(len(members)) for members in classes]
+    return [min(chosen, limit) for limit in limits]
 
 
 def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
@@ -236,7 +236,7 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
     strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
     # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
     count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
-    few = min(count, _few(len(points)))
+    few = min(count, _max_singletons(len(points)))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
     finest = max(len(points) // POINTS_PER_CLUSTER, few)
     coarsest = len(points) // DENSE_POINTS
@@ -290,15 +290,15 @@ def mini_batch_kmeans(
     rows = spread_rows(len(points), batch_size, rng, iterations)
     if native.supports(points):
         return torch.ops.lardhm.kmeans(points, centers, rows, batch_size, restart_every)
-    met = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
+    counts = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
     for iteration in range(iterations):
         if iteration % restart_every == 0:
-            met.zero_()
+            counts.zero_()
         batch = points[rows[iteration]]
         labels = nearest_centers(batch, centers, 1).squeeze(1)
-        pulls = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
-        met += torch.bincount(labels, minlength=num_clusters)
-        centers = centers + pulls / met.clamp(min=1)[:, None]
+        shifts = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
+        counts += torch.bincount(labels, minlength=num_clusters)
+        centers = centers + shifts / counts.clamp(min=1)[:, None]
     return centers
 
 
@@ -319,8 +319,8 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     behind = torch.cat([gaps[:1].expand(lag), gaps])
     weight = torch.minimum(ahead, behind).double()
     along = (weight + 1e-6 * weight.mean() + 1e-300).cumsum(0)
-    share = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
-    place = (torch.arange(num_clusters, device=rng.device) + share) / num_clusters * along[-1]
+    position = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
+    place = (torch.arange(num_clusters, device=rng.device) + position) / num_clusters * along[-1]
     return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
 
 
@@ -332,7 +332,9 @@ def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) 
     return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
 
-def clusters_about(centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor) -> Clusters:
+def clusters_from_moments(
+    centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor
+) -> Clusters:
     """Clusters from the moments about the centers that `native.assign` returns.
 
     Args:
@@ -359,15 +361,15 @@ def pool_clusters(clusters: Clusters, groups: Tensor, num_groups: int) -> Cluste
         groups: (M,) group of each cluster, 0 to num_groups - 1.
         num_groups: number of groups.
     """
-    shares = clusters.counts.to(clusters.means.dtype)
+    sizes = clusters.counts.to(clusters.means.dtype)
     counts = clusters.counts.new_zeros(num_groups).index_add_(0, groups, clusters.counts)
     shape = (num_groups, clusters.means.shape[1])
     anchor = clusters.means.new_zeros(shape).index_copy_(0, groups, clusters.means)
-    offsets = (clusters.means - anchor[groups]) * shares[:, None]
+    offsets = (clusters.means - anchor[groups]) * sizes[:, None]
     shift = clusters.means.new_zeros(shape).index_add_(0, groups, offsets)
     means = anchor + shift / counts.clamp(min=1)[:, None]
     apart = clusters.means - means[groups]
-    between = shares[:, None, None] * apart[:, :, None] * apart[:, None, :]
+    between = sizes[:, None, None] * apart[:, :, None] * apart[:, None, :]
     scatters = between.new_zeros(*shape, shape[1]).index_add_(
         0, groups, clusters.scatters + between
     )

@@ -19,7 +19,7 @@ from lardhm_torch.sampling import Samples, seeded_generator
 WARM_UP_STEPS = 20  # number of steps of the learning rate warm-up
 MAX_BATCH = 1 << 15  # upper bound on the default batch size, to limit memory
 State = dict[str, Any]  # tensors and plain values, for `torch.save` and `torch.load`
-JUDGED_POINTS = 1 << 16  # number of points used to evaluate the loss after each epoch
+EVALUATION_POINTS = 1 << 16  # number of points used to evaluate the loss after each epoch
 
 
 def fine_tune(
@@ -82,9 +82,9 @@ def fine_tune(
         )
     rng = seeded_generator(seed, "fine_tune", model.origin.device)
     held_rays = _hold_out(samples, config.hold_out, rng)
-    train, judged = _divide(samples, held_rays)
+    train, evaluation = _divide(samples, held_rays)
     run = TuningRun(model, config, rng)
-    run.load(state) if state else run.losses.append(run.judge(judged))
+    run.load(state) if state else run.losses.append(run.evaluate(evaluation))
     with tqdm(total=config.epochs, initial=run.epoch, disable=None if progress else True) as bar:
         while run.epoch < config.epochs and not run.stalled():
             if resample and run.epoch:
@@ -92,7 +92,7 @@ def fine_tune(
                 fresh_samples = _check(model, fresh.points, fresh.labels, fresh.ray_id)
                 train = _divide(fresh_samples, held_rays)[0]
             run.train(train)
-            run.keep_best(run.judge(judged))
+            run.keep_best(run.evaluate(evaluation))
             bar.set_postfix(loss=f"{run.losses[-1]:.4f}")
             bar.update()
             if after_epoch:
@@ -118,13 +118,13 @@ def _check(
     return LabelledPoints(points, labels, ray_id)
 
 
-def _hold_out(samples: LabelledPoints, share: float, rng: torch.Generator) -> Tensor | None:
+def _hold_out(samples: LabelledPoints, fraction: float, rng: torch.Generator) -> Tensor | None:
     """IDs of a random fraction of the rays, or rows of points without ray IDs; None if none or all."""
-    if not share:
+    if not fraction:
         return None
     rays = samples.ray_id
     ids = torch.arange(len(samples.labels), device=rng.device) if rays is None else rays.unique()
-    held = ids[torch.rand(len(ids), generator=rng, device=rng.device) < share]
+    held = ids[torch.rand(len(ids), generator=rng, device=rng.device) < fraction]
     return held if 0 < len(held) < len(ids) else None
 
 
@@ -133,15 +133,15 @@ def _divide(
 ) -> tuple[LabelledPoints, LabelledPoints]:
     """Training points, and evaluation points: held-out points, or a subset of the training points."""
     if held_rays is None:
-        train = judged = samples
+        train = evaluation = samples
     else:
         positions, labels, rays = samples
         rays = torch.arange(len(labels), device=labels.device) if rays is None else rays
         held = torch.isin(rays, held_rays)
         train = LabelledPoints(positions[~held], labels[~held], None)
-        judged = LabelledPoints(positions[held], labels[held], None)
-    every = -(-len(judged.labels) // JUDGED_POINTS)
-    return train, LabelledPoints(judged.positions[::every], judged.labels[::every], None)
+        evaluation = LabelledPoints(positions[held], labels[held], None)
+    every = -(-len(evaluation.labels) // EVALUATION_POINTS)
+    return train, LabelledPoints(evaluation.positions[::every], evaluation.labels[::every], None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,13 +256,13 @@ class TuningRun:
             self.optimizer.zero_grad()
             (loss + penalty / count).backward()
             for group in self.optimizer.param_groups:
-                group["lr"] = group["full_rate"] * _rate_share(self.step, total_steps)
+                group["lr"] = group["full_rate"] * _rate_fraction(self.step, total_steps)
             self.optimizer.step()
             self.step += 1
         self.epoch += 1
 
     @torch.no_grad()
-    def judge(self, samples: LabelledPoints) -> float:
+    def evaluate(self, samples: LabelledPoints) -> float:
         """Mean balanced log-loss on the points."""
         current = self.current()
         chunks = samples.positions.split(MAX_BATCH)
@@ -335,6 +335,6 @@ def batches(count: int, batch_size: int, rng: torch.Generator) -> Iterator[Tenso
         yield rows[rows < count]
 
 
-def _rate_share(step: int, total_steps: int) -> float:
+def _rate_fraction(step: int, total_steps: int) -> float:
     """Fraction of the full learning rate: a short warm-up, and a linear decay to 0."""
     return min(1.0, (step + 1) / WARM_UP_STEPS) * max(0.0, 1 - step / total_steps)

@@ -45,14 +45,14 @@ class FitConfig:
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # loss of unknown points, relative to all others
 
-    def rows_a_batch(self, num_points: int) -> int:
+    def rows_per_batch(self, num_points: int) -> int:
         """Points per step: about ``batch_size``, with equally large batches in each pass."""
         wanted = self.batch_size or max(256, num_points // 128)
         return -(-num_points // -(-num_points // wanted)) if num_points else wanted
 
     def passes_over(self, num_points: int) -> int:
         """Number of passes over ``num_points`` points."""
-        batches = max(1, -(-num_points // self.rows_a_batch(num_points)))
+        batches = max(1, -(-num_points // self.rows_per_batch(num_points)))
         return self.passes or max(PASSES, -(-MIN_STEPS // batches))
 
     def __post_init__(self) -> None:
@@ -95,7 +95,8 @@ def fit_clusters(
     clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
     columns = settle_unknown(points, labels, state, task.kernel, task.rng)
-    points, labels = deal_samples(columns, task.config.rows_a_batch(len(columns[0])), task.rng)
+    batch_size = task.config.rows_per_batch(len(columns[0]))
+    points, labels = stratified_batches(columns, batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:
@@ -106,7 +107,7 @@ def fit_clusters(
     return replace(state, weights=weights)
 
 
-def deal_samples(
+def stratified_batches(
     columns: tuple[Tensor, ...], batch_size: int, rng: torch.Generator
 ) -> tuple[Tensor, ...]:
     """Reorder samples from Morton order into consecutive stratified mini-batches, for `fit_weights`.
@@ -196,12 +197,12 @@ def fit_weights(
     w <- w - eta_t A^-1 g, where g is the gradient of a batch scaled to all points. The preconditioner
     A is the running root mean square of g, and g is averaged over steps (Adam), so that weights of
     rarely observed clusters converge as fast as others. Points are used in the given order, which
-    should be that of `deal_samples`. Features are cached up to `CACHE_BYTES`. For chunks that do not
-    fit, features are computed once per two passes, which are then run back to back.
+    should be that of `stratified_batches`. Features are cached up to `CACHE_BYTES`. For chunks that
+    do not fit, features are computed once per two passes, which are then run back to back.
 
     Args:
         features_of: function of a slice of B rows that returns (B, K) indices and kernel values.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown, in the order of `deal_samples`.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown, in the order of `stratified_batches`.
         weights: (M,) initial weights; not modified.
         config: passes, rates and regularizer.
         progress: show a progress bar on a terminal.
@@ -213,9 +214,11 @@ def fit_weights(
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
     if factors is None:
-        shares = (config.occupied_share, config.unknown_share)
-        factors = balance_classes(labels, *shares) if config.balance else torch.ones_like(labels)
-    batch_size = config.rows_a_batch(len(labels))
+        class_weights = (config.occupied_share, config.unknown_share)
+        factors = (
+            balance_classes(labels, *class_weights) if config.balance else torch.ones_like(labels)
+        )
+    batch_size = config.rows_per_batch(len(labels))
     passes = config.passes_over(len(labels))
     plan = _Plan(config, batch_size, len(labels), passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))
@@ -254,8 +257,8 @@ class _Features:
 
     def __init__(self, features_of: FeaturesOf, chunk_rows: int) -> None:
         self.features_of, self.chunk_rows = features_of, chunk_rows
-        self.kept: dict[int, tuple[Tensor, Tensor]] = {}
-        self.room = CACHE_BYTES
+        self.cache: dict[int, tuple[Tensor, Tensor]] = {}
+        self.free_bytes = CACHE_BYTES
 
     def chunks(self, num_rows: int) -> Iterator[slice]:
         """Slices that cover all rows, in order."""
@@ -264,17 +267,17 @@ class _Features:
 
     def keeps(self, rows: slice) -> bool:
         """Whether the features of a chunk are cached."""
-        return rows.start in self.kept
+        return rows.start in self.cache
 
     def __getitem__(self, rows: slice) -> tuple[Tensor, Tensor]:
         """Indices and kernel values (R, K) of one chunk."""
         if self.keeps(rows):
-            return self.kept[rows.start]
+            return self.cache[rows.start]
         found = self.features_of(rows)
         size = sum(tensor.numel() * tensor.element_size() for tensor in found)
-        if size <= self.room:
-            self.kept[rows.start] = found
-            self.room -= size
+        if size <= self.free_bytes:
+            self.cache[rows.start] = found
+            self.free_bytes -= size
         return found
 
 
@@ -304,8 +307,8 @@ def batch_gradient(
     """(M,) gradient of the batch's loss with respect to the weights: Phi^T (p - y)."""
     log_odds = (values * weights[indices]).sum(dim=1)
     residuals = factors * (torch.sigmoid(log_odds) - labels)
-    pulls = (residuals[:, None] * values).reshape(-1)
-    return torch.zeros_like(weights).index_add_(0, indices.reshape(-1), pulls)
+    terms = (residuals[:, None] * values).reshape(-1)
+    return torch.zeros_like(weights).index_add_(0, indices.reshape(-1), terms)
 
 
 def descend(
@@ -324,13 +327,13 @@ def descend(
     weights, mean, square = state
     slope = slope + 2 * config.l2 / num_points * weights
     if not config.preconditioner:
-        moved, reach = weights - rate * slope, torch.full_like(weights, rate)
+        moved, step_size = weights - rate * slope, torch.full_like(weights, rate)
     else:
         mean = 0.9 * mean + 0.1 * slope
         square = 0.99 * square + 0.01 * slope.square()
-        reach = rate / ((square / (1 - 0.99**step)).sqrt() + 1e-10)
-        moved = weights - reach * mean / (1 - 0.9**step)
+        step_size = rate / ((square / (1 - 0.99**step)).sqrt() + 1e-10)
+        moved = weights - step_size * mean / (1 - 0.9**step)
     if config.l1:
-        threshold = reach * config.l1 / num_points
+        threshold = step_size * config.l1 / num_points
         moved = moved.sign() * (moved.abs() - threshold).clamp(min=0)
     return moved, mean, square

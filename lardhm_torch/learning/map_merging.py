@@ -16,13 +16,13 @@ from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
-from lardhm_torch.learning.replay import Evidence, join_evidence, learn, recalled_evidence
+from lardhm_torch.learning.replay import Evidence, join_evidence, learn, replay_evidence
 from lardhm_torch.sampling import seeded_generator
 
 AnyMap = TypeVar("AnyMap", bound=MapParameters)
 
 ZETA = 1.0  # [m] maximum distance of matching clusters (zeta in Algorithm 2)
-RECALLED = 16  # number of pseudo-samples per cluster
+SAMPLES_PER_CLUSTER = 16  # number of pseudo-samples per cluster
 TOLERANCE = 0.01  # accepted change of a probability by merging
 
 
@@ -64,21 +64,21 @@ def moved(
     new_origin = place.round()  # whole meters, as in `fit`
     shift = place - new_origin
 
-    def turned(points: Tensor) -> Tensor:
+    def transformed(points: Tensor) -> Tensor:
         return (points.double() @ rotation.T + shift).to(points.dtype)
 
     scatters = rotation @ state.scatters.double() @ rotation.T
     after = replace(
         state,
-        centers=turned(state.centers),
-        raw_scale_tril=_turned_factors(state.raw_scale_tril, rotation),
-        means=turned(state.means),
+        centers=transformed(state.centers),
+        raw_scale_tril=_rotated_factors(state.raw_scale_tril, rotation),
+        means=transformed(state.means),
         scatters=scatters.to(state.scatters.dtype),
     )
     return after, new_origin
 
 
-def _turned_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
+def _rotated_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
     """Raw Cholesky factors of R L L^T R^T, from the QR decomposition of (R L)^T."""
     diagonal = raw_scale_tril.double().diagonal(dim1=-2, dim2=-1).exp()
     factors = raw_scale_tril.double().tril(-1) + torch.diag_embed(diagonal)
@@ -146,7 +146,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     theirs = replace(theirs, centers=theirs.centers + shift, means=theirs.means + shift)
     rng = seeded_generator(seed, "merge_maps", shift.device)
     pooled = _pooled(ours, theirs, first.kernel)
-    write_state(joined, _settled(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
+    write_state(joined, _retrained(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
     return joined
 
 
@@ -164,11 +164,11 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
     rows = torch.cat([torch.arange(len(where), device=groups.device), groups])
     clusters = concatenate_clusters([before.clusters, others.clusters])
     pooled = pool_clusters(clusters, rows, len(where))
-    share = clusters.counts / pooled.counts[rows]
+    fraction = clusters.counts / pooled.counts[rows]
 
     def average(mine: Tensor, other: Tensor) -> Tensor:
         values = torch.cat([mine, other])
-        shaped = share.to(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
+        shaped = fraction.to(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
         return torch.zeros_like(mine).index_add_(0, rows, shaped * values)
 
     spreads = [
@@ -189,11 +189,11 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
     return ours.put(where, tail)
 
 
-def _settled(
+def _retrained(
     joined: MapState, ours: MapState, theirs: MapState, kernel: Kernel, rng: torch.Generator
 ) -> MapState:
     """Retrain the weights of the merged map where it deviates from the original maps."""
-    evidence = join_evidence([_everything(state, kernel, rng) for state in (ours, theirs)])
+    evidence = join_evidence([_map_evidence(state, kernel, rng) for state in (ours, theirs)])
     tensors = (joined.centers, joined.raw_scale_tril, joined.weights, kernel)
     index = native.build_index(joined.centers, kernel.num_neighbors)
     probability = native.occupancy(evidence.points, *tensors, probability=True, index=index)
@@ -208,8 +208,9 @@ def _settled(
     return replace(joined, weights=torch.where(open_rows, learned, joined.weights))
 
 
-def _everything(state: MapState, kernel: Kernel, rng: torch.Generator) -> Evidence:
+def _map_evidence(state: MapState, kernel: Kernel, rng: torch.Generator) -> Evidence:
     """Pseudo-samples of a complete map, weighted by the number of points of each cluster."""
     rows = torch.arange(len(state), device=state.weights.device)
-    strength = (state.counts / RECALLED).to(state.weights.dtype)[:, None].expand(-1, RECALLED)
-    return recalled_evidence(state, rows, kernel, strength, rng)
+    strength = (state.counts / SAMPLES_PER_CLUSTER).to(state.weights.dtype)[:, None]
+    strength = strength.expand(-1, SAMPLES_PER_CLUSTER)
+    return replay_evidence(state, rows, kernel, strength, rng)

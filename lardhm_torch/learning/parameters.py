@@ -13,8 +13,8 @@ from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.map_state import MapState
 
-OF_THE_WHOLE = ("origin", "posterior_scales")  # tensors without one row per cluster
-RESERVE = 0.25  # spare capacity of a growing map, as a fraction of its clusters
+PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
+SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
 
 
 class MapParameters(nn.Module):
@@ -53,9 +53,9 @@ class MapParameters(nn.Module):
         self.min_lengthscale = float(min_lengthscale)
         self._register_empty(dim, device, dtype)
         self._index = torch.empty(0, dtype=torch.uint8)
-        self._reserves: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
+        self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self.register_load_state_dict_pre_hook(make_room)
-        self.register_state_dict_post_hook(drop_reserve)
+        self.register_state_dict_post_hook(drop_spare_rows)
 
     def _register_empty(
         self, dim: int, device: torch.device | str | None, dtype: torch.dtype | None
@@ -150,11 +150,11 @@ def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> No
     if len(model) == num_clusters:
         return
     for name, tensor in list(model.state_tensors()):
-        if name in OF_THE_WHOLE:
+        if name in PER_MAP:
             continue
-        room = _longer(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
+        room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
         if isinstance(tensor, nn.Parameter):
-            _give_room(tensor, room)
+            _set_shape(tensor, room)
         else:
             setattr(model, name, room)
 
@@ -163,7 +163,7 @@ def _zeros(tensor: Tensor, rows: int) -> Tensor:
     return tensor.detach().new_zeros(rows, *tensor.shape[1:])
 
 
-def _longer(model: MapParameters, name: str, rows: int) -> Tensor:
+def _with_rows(model: MapParameters, name: str, rows: int) -> Tensor:
     """The tensor with a different number of rows. Added rows are 0.
 
     The storage is reused if it is large enough and was allocated by this function. Any other storage
@@ -171,20 +171,20 @@ def _longer(model: MapParameters, name: str, rows: int) -> Tensor:
     """
     tensor = getattr(model, name).detach()
     storage, before = tensor.untyped_storage(), len(tensor)
-    made_here = model._reserves.get(name) == (storage.data_ptr(), storage.nbytes())
-    bytes_a_row = tensor.element_size() * tensor[:1].numel() if before else 0
-    if not made_here or not 0 < rows * bytes_a_row <= storage.nbytes():
-        reserve = _zeros(tensor, rows + int(RESERVE * rows))
+    made_here = model._spare_storages.get(name) == (storage.data_ptr(), storage.nbytes())
+    bytes_per_row = tensor.element_size() * tensor[:1].numel() if before else 0
+    if not made_here or not 0 < rows * bytes_per_row <= storage.nbytes():
+        reserve = _zeros(tensor, rows + int(SPARE_FRACTION * rows))
         reserve[: min(rows, before)] = tensor[:rows]
         storage = reserve.untyped_storage()
-        model._reserves[name] = (storage.data_ptr(), storage.nbytes())
+        model._spare_storages[name] = (storage.data_ptr(), storage.nbytes())
         return reserve[:rows]
-    longer = tensor.as_strided((rows, *tensor.shape[1:]), tensor.stride(), 0)
-    longer[before:] = 0
-    return longer
+    resized = tensor.as_strided((rows, *tensor.shape[1:]), tensor.stride(), 0)
+    resized[before:] = 0
+    return resized
 
 
-def _give_room(parameter: nn.Parameter, room: Tensor) -> None:
+def _set_shape(parameter: nn.Parameter, room: Tensor) -> None:
     """Change the shape of a parameter in place, even if it is part of an autograd graph.
 
     The temporary change of dtype makes autograd discard the old shape. New graphs then compute
@@ -216,7 +216,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
         raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
     num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
     for name, tensor in own.items():
-        shape = tensor.shape if name in OF_THE_WHOLE else (num_clusters, *tensor.shape[1:])
+        shape = tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
         if state[prefix + name].shape != torch.Size(shape):
             raise ValueError(
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
@@ -234,7 +234,7 @@ def _fill_posterior(state: dict[str, Any], prefix: str) -> None:
         state.setdefault(prefix + "posterior_scales", torch.ones(2, dtype=weights.dtype))
 
 
-def drop_reserve(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
     for name, _tensor in model.state_tensors():
         value = state.get(prefix + name)

@@ -24,14 +24,14 @@ PRIOR_VARIANCE = 0.3  # of a weight, and of the log-odds far from all clusters (
 QUERY_CHUNK = 1 << 17  # number of points processed at a time
 # Factor on the variance in `moderate`. The diagonal posterior ignores that the weights of overlapping
 # clusters are negatively correlated, so it overestimates the variance. Empirical.
-OWN_SHARE = 1 / 3
+VARIANCE_FACTOR = 1 / 3
 ROUNDS = 3  # of the variational bound; the third round changes variances by less than 2 %
 SCALES = (0.5, 4.0, 43)  # search grid of factors on the log-odds: first, last, number
 SCALE_POINTS = 50_000  # approximate number of points used to choose the factors
 # Exponents that damp the factors found by leave-one-out: effect of the factor of occupied log-odds on
 # the free ones (in addition to the second), on both, and of the free ones on themselves. Chosen
 # empirically on held-out rays of all data sets.
-TRUST = (0.3, 0.3, 0.04)
+DAMPING_EXPONENTS = (0.3, 0.3, 0.04)
 MAX_LEVERAGE = 0.8  # upper bound on the leverage term, beyond which the expansion is invalid
 
 
@@ -122,12 +122,12 @@ def posterior_scales(
     shrink the log-odds again. For each sign of the log-odds, the factor sqrt(1 + pi v / 8), with the
     median over the points, compensates for this. It is multiplied by powers of the ratio between the
     factor with the smallest balanced log-loss of moderated leave-one-out predictions and the
-    compensating factor. The exponents are `TRUST`: the ratio of the occupied points affects both
-    factors, that of the free points hardly any. Training points leave a gap in front of each hit, so
-    free training points are easier to classify than those of unseen rays.
+    compensating factor, with the exponents `DAMPING_EXPONENTS`. The ratio of the occupied points
+    affects both factors, that of the free points has little effect. Training points leave a gap in
+    front of each hit, so free training points are easier to classify than those of unseen rays.
 
     To first order, leaving out point i changes its log-odds by h_i (p_i - y_i) / (1 - h_i c_i), with
-    leverage h_i = `OWN_SHARE` * sum_m phi_im^2 v_m and curvature c_i.
+    leverage h_i = `VARIANCE_FACTOR` * sum_m phi_im^2 v_m and curvature c_i.
 
     Args:
         indices: (N, K) nearest clusters of each training point.
@@ -142,16 +142,16 @@ def posterior_scales(
     some = slice(None, None, 1 + len(labels) // SCALE_POINTS)
     indices, values, log_odds, labels = (t[some] for t in (indices, values, log_odds, labels))
     residuals = torch.sigmoid(log_odds) - labels
-    leverage = OWN_SHARE * (values.square() * variances[indices]).sum(dim=1)
+    leverage = VARIANCE_FACTOR * (values.square() * variances[indices]).sum(dim=1)
     expected = (log_odds.square() + leverage).sqrt()
     damping = 1 - (leverage * logistic_curvature(expected)).clamp(max=MAX_LEVERAGE)
     left_out = log_odds + leverage * residuals / damping
-    variance = OWN_SHARE * latent_variance(indices, values, variances)
+    variance = VARIANCE_FACTOR * latent_variance(indices, values, variances)
     points = torch.stack([left_out, variance, labels, balance_classes(labels)])
     neutral, excess = torch.stack(
         [_scale_of_side(points[:, side]) for side in (left_out < 0, left_out >= 0)]
     ).T
-    free, both, free_itself = TRUST
+    free, both, free_itself = DAMPING_EXPONENTS
     powers = excess.new_tensor([[free_itself, both + free], [0.0, both]])
     return neutral * (excess.log() * powers).sum(dim=1).exp()
 

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.assignment import explain, ordered_features, possibly_inside
+from lardhm_torch.learning.assignment import explain, inside_candidates, ordered_features
 from lardhm_torch.learning.clustering import MIN_COUNT, Columns, spread_rows
-from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
+from lardhm_torch.learning.fitting import FitConfig, class_factors, fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.points import in_morton_order
 
 INSIDE = 3.0  # Mahalanobis radius within which a point lies in an occupied cluster
-KEPT = 0.25  # fraction of the count that a contradicted cluster keeps
+KEPT_FRACTION = 0.25  # fraction of the count that a contradicted cluster keeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> lis
     return parts
 
 
-def recalled_evidence(
+def replay_evidence(
     known: MapState, rows: Tensor, kernel: Kernel, strength: Tensor, rng: torch.Generator
 ) -> Evidence:
     """Pseudo-samples drawn from clusters, labelled with the probability of the map.
@@ -84,11 +84,11 @@ def recalled_evidence(
         strength: (Q, P) sample weights of the P pseudo-samples of each cluster.
         rng: random generator.
     """
-    recalling = known.rows(rows)
-    points = draw_points(recalling, strength.shape[1], kernel.min_lengthscale, rng)
+    sources = known.rows(rows)
+    points = draw_points(sources, strength.shape[1], kernel.min_lengthscale, rng)
     state = (known.centers, known.raw_scale_tril, known.weights, kernel)
     labels = native.occupancy(points, *state, probability=True)
-    is_occupied = recalling.is_occupied[:, None].expand_as(strength)
+    is_occupied = sources.is_occupied[:, None].expand_as(strength)
     return Evidence(points, labels, is_occupied.reshape(-1), strength.reshape(-1))
 
 
@@ -122,29 +122,29 @@ def contradicted(
         passed: (N, D) free points of the scan, or a subset that represents them [m].
         floor: smallest standard deviation [m].
     """
-    worth = torch.full_like(known.weights, torch.inf)
+    bound = torch.full_like(known.weights, torch.inf)
     occupied = known.is_occupied.nonzero().squeeze(1)
     if len(occupied) == 0 or num_hits == 0 or len(passed) == 0:
-        return worth
-    share = num_hits / len(passed)  # weight of a free point that balances the classes
+        return bound
+    point_weight = num_hits / len(passed)  # weight of a free point that balances the classes
     unseen = known.rows(known.is_occupied & ~hit).clusters
-    passed = possibly_inside(passed, unseen, floor, INSIDE)
-    passes = share * _points_inside(known.rows(occupied), passed, floor).to(worth)
+    passed = inside_candidates(passed, unseen, floor, INSIDE)
+    passes = point_weight * _points_inside(known.rows(occupied), passed, floor).to(bound)
     denied = (passes > 0) & ~hit[occupied]
-    return worth.index_copy_(0, occupied, passes.where(denied, torch.inf))
+    return bound.index_copy_(0, occupied, passes.where(denied, torch.inf))
 
 
-def forget(part: MapState, worth: Tensor, memory: float) -> MapState:
-    """Evidence decay: reduce the counts of contradicted clusters to the fraction `KEPT`.
+def decay_evidence(part: MapState, bound: Tensor, memory: float) -> MapState:
+    """Evidence decay: reduce the counts of contradicted clusters to the fraction `KEPT_FRACTION`.
 
-    Counts are capped at ``memory`` before they are reduced. Covariances do not change. ``worth`` is
+    Counts are capped at ``memory`` before they are reduced. Covariances do not change. ``bound`` is
     the (Q,) result of `contradicted` for the first Q clusters.
     """
-    worth = torch.cat([worth, worth.new_full((len(part) - len(worth),), torch.inf)])
-    kept = (KEPT * part.counts.clamp(max=memory)).long().clamp(min=MIN_COUNT)
-    counts = torch.where(worth < kept, kept, part.counts).minimum(part.counts)
-    share = (counts - 1).clamp(min=1) / (part.counts - 1).clamp(min=1)
-    return replace(part, counts=counts, scatters=part.scatters * share.to(worth)[:, None, None])
+    bound = torch.cat([bound, bound.new_full((len(part) - len(bound),), torch.inf)])
+    kept = (KEPT_FRACTION * part.counts.clamp(max=memory)).long().clamp(min=MIN_COUNT)
+    counts = torch.where(bound < kept, kept, part.counts).minimum(part.counts)
+    fraction = (counts - 1).clamp(min=1) / (part.counts - 1).clamp(min=1)
+    return replace(part, counts=counts, scatters=part.scatters * fraction.to(bound)[:, None, None])
 
 
 def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator) -> Tensor:
@@ -162,14 +162,14 @@ def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator)
     shape = (num_clusters, pairs, dim)
     direction = torch.randn(shape, generator=rng, device=rng.device, dtype=factors.dtype)
     direction /= torch.linalg.vector_norm(direction, dim=2, keepdim=True)
-    share = torch.rand(num_clusters, pairs, 1, generator=rng, device=rng.device).to(factors)
-    share = (share + torch.arange(pairs, device=rng.device)[:, None]) / pairs
-    ball = (dim + 2) ** 0.5 * share ** (1 / dim) * direction
+    volume = torch.rand(num_clusters, pairs, 1, generator=rng, device=rng.device).to(factors)
+    volume = (volume + torch.arange(pairs, device=rng.device)[:, None]) / pairs
+    ball = (dim + 2) ** 0.5 * volume ** (1 / dim) * direction
     ball = torch.cat([ball, -ball], dim=1)[:, :count]
     return (clusters.means[:, None] + ball @ factors.mT).reshape(-1, dim)
 
 
-def around(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
+def neighborhood(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
     """(M,) bool mask of changed clusters, their neighbors, and the neighbors of those.
 
     New points also affect the weights of the neighbors, so pseudo-samples of the second neighbors are
@@ -210,10 +210,10 @@ def learn(
         config: passes, rates and regularizer.
         rng: random generator.
     """
-    batch_size = config.rows_a_batch(len(evidence))
+    batch_size = config.rows_per_batch(len(evidence))
     points, *columns = in_morton_order(*evidence)
     rows = torch.arange(len(points), device=points.device)
-    order, labels, is_occupied, strength = deal_samples((rows, *columns), batch_size, rng)
+    order, labels, is_occupied, strength = stratified_batches((rows, *columns), batch_size, rng)
     indices, values = ordered_features(
         points, order, state.centers, state.raw_scale_tril, kernel, index
     )

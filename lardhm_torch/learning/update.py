@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.assignment import explain, reaching, unexplained
+from lardhm_torch.learning.assignment import explain, kernels_near, unexplained
 from lardhm_torch.learning.cluster_matching import (
     append_clusters,
     merge_clusters,
@@ -36,22 +36,22 @@ from lardhm_torch.learning.clustering import (
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.replay import (
-    around,
     contradicted,
-    forget,
+    decay_evidence,
     hit_clusters,
     join_evidence,
     learn,
+    neighborhood,
     new_evidence,
-    recalled_evidence,
+    replay_evidence,
     spread_points,
 )
 from lardhm_torch.points import in_morton_order
 
-COVERED = 0.36  # a scan covers a cluster if its points have this fraction of the variance
-SMOOTHER = 2.0  # factor on `UpdateConfig.crowded` for free clusters, which may be coarser
-REACH = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
-LOOKED_AT = 4  # number of free points checked for contradictions, relative to max_points
+COVERED_FRACTION = 0.36  # a scan covers a cluster if its points have this fraction of the variance
+FREE_FACTOR = 2.0  # factor on `UpdateConfig.crowded` for free clusters, which may be coarser
+BOX_STDS = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
+CHECKED_POINTS = 4  # number of free points checked for contradictions, relative to max_points
 # Pseudo-samples already contain the class weight of `fit`, so the classes get equal weights here.
 UPDATE_FIT = FitConfig(batch_size=1024, l2=0.01, occupied_share=0.5)
 
@@ -122,7 +122,7 @@ def updated(
 
     Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
     """
-    near = reaching(state.centers, state.raw_scale_tril, task.kernel, points, REACH)
+    near = kernels_near(state.centers, state.raw_scale_tril, task.kernel, points, BOX_STDS)
     nearby = near.nonzero().squeeze(1)
     known = state.rows(nearby)
     classes = split_classes(points, labels > 0.5)
@@ -149,8 +149,8 @@ def _grown(
     part, hit = known, torch.zeros_like(known.is_occupied)
     for kind, members, total in zip((True, False), classes, totals, strict=True):
         if total:
-            part, met = absorb(part, members, kind, total, task)
-            hit = hit.index_fill(0, met, True) if kind else hit
+            part, joined = absorb(part, members, kind, total, task)
+            hit = hit.index_fill(0, joined, True) if kind else hit
     return part, hit
 
 
@@ -174,17 +174,18 @@ def _train(
         return replace(part, weights=learned)
     changed = torch.ones_like(part.is_occupied)
     changed[: len(known)] = (part.means[: len(known)] != known.means).any(dim=1)
-    moving = around(changed, part.centers, kernel.num_neighbors, index)
+    moving = neighborhood(changed, part.centers, kernel.num_neighbors, index)
     rows = moving[: len(known)].nonzero().squeeze(1)
-    looked_at = LOOKED_AT * config.max_points
-    passed = spread_points(classes[1], looked_at, rng)
-    worth = contradicted(known, hit, len(classes[0]), passed, kernel.min_lengthscale)
-    strength = known.counts.clamp(max=config.memory).to(worth).minimum(worth)[rows]
+    num_checked = CHECKED_POINTS * config.max_points
+    passed = spread_points(classes[1], num_checked, rng)
+    bound = contradicted(known, hit, len(classes[0]), passed, kernel.min_lengthscale)
+    strength = known.counts.clamp(max=config.memory).to(bound).minimum(bound)[rows]
     strength = (strength / config.replay)[:, None].expand(-1, config.replay)
-    old = recalled_evidence(known, rows, kernel, strength, rng)
+    old = replay_evidence(known, rows, kernel, strength, rng)
     learned = learn(part, join_evidence([*new, old]), kernel, index, config.fit, rng)
     return replace(
-        forget(part, worth, config.memory), weights=torch.where(moving, learned, part.weights)
+        decay_evidence(part, bound, config.memory),
+        weights=torch.where(moving, learned, part.weights),
     )
 
 
@@ -208,47 +209,47 @@ def absorb(
     floor = task.kernel.min_lengthscale
     own = (part.is_occupied == is_occupied).nonzero().squeeze(1)
     known = part.rows(own)
-    look = _explain(known, points, len(points) / num_clusters, task)
-    pooled = (look.found.counts > 0).nonzero().squeeze(1)
-    part = pool_into(part, own[pooled], take_clusters(look.found, pooled), floor)
-    met = torch.cat([own[pooled], own[look.outgrown]])
-    if len(look.rest) < MIN_COUNT:
-        return part, met
-    (rest,) = in_morton_order(look.rest)
-    share = -(-num_clusters * len(rest) // len(points))
-    new = cluster_points(rest, share, task.rng)
-    new, where = _settle(known, new, look, task)
+    assignment = _assign(known, points, len(points) / num_clusters, task)
+    pooled = (assignment.found.counts > 0).nonzero().squeeze(1)
+    part = pool_into(part, own[pooled], take_clusters(assignment.found, pooled), floor)
+    joined = torch.cat([own[pooled], own[assignment.too_coarse]])
+    if len(assignment.rest) < MIN_COUNT:
+        return part, joined
+    (rest,) = in_morton_order(assignment.rest)
+    num_new = -(-num_clusters * len(rest) // len(points))
+    new = cluster_points(rest, num_new, task.rng)
+    new, where = _select_new(known, new, assignment, task)
     kinds = torch.full((len(new),), is_occupied, device=points.device)
-    return append_clusters(part, new, kinds, floor, own[where]), met
+    return append_clusters(part, new, kinds, floor, own[where]), joined
 
 
-class _Look(NamedTuple):
+class _Assignment(NamedTuple):
     """Assignment of new points to known clusters.
 
-    ``found`` holds the moments of the points that join each cluster. ``outgrown`` masks the clusters
+    ``found`` holds the moments of the points that join each cluster. ``too_coarse`` masks the clusters
     that are too coarse for the scan, and ``covered`` those of them that the scan covers completely.
-    ``rest`` holds the points of the outgrown clusters, and the points without a nearby cluster.
+    ``rest`` holds the points of too coarse clusters, and the points without a nearby cluster.
     """
 
     rest: Tensor
     found: Clusters
-    outgrown: Tensor
+    too_coarse: Tensor
     covered: Tensor
 
 
-def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Look:
+def _assign(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Assignment:
     config, clusters = task.config, known.clusters
     if len(known) == 0:
-        return _Look(points, clusters, known.is_occupied, known.is_occupied)
+        return _Assignment(points, clusters, known.is_occupied, known.is_occupied)
     rule = (task.kernel.min_lengthscale, config.radius, config.reach)
     owners, found = explain(points, clusters, *rule)
     # Cap the count, so that a cluster that grew over many scans can still be found to be too coarse.
-    most = config.crowded if bool(known.is_occupied[0]) else SMOOTHER * config.crowded
+    most = config.crowded if bool(known.is_occupied[0]) else FREE_FACTOR * config.crowded
     past = clusters.counts.clamp(2 * usual_count, most * usual_count)
-    outgrown = found.counts > config.refine * past
-    covered = outgrown & (_spread(found) > COVERED * _spread(clusters))
-    found = Clusters(found.counts * ~outgrown, found.means, found.scatters)
-    return _Look(unexplained(points, owners, ~outgrown), found, outgrown, covered)
+    too_coarse = found.counts > config.refine * past
+    covered = too_coarse & (_spread(found) > COVERED_FRACTION * _spread(clusters))
+    found = Clusters(found.counts * ~too_coarse, found.means, found.scatters)
+    return _Assignment(unexplained(points, owners, ~too_coarse), found, too_coarse, covered)
 
 
 def _spread(clusters: Clusters) -> Tensor:
@@ -257,7 +258,9 @@ def _spread(clusters: Clusters) -> Tensor:
     return total / clusters.counts.clamp(min=1)
 
 
-def _settle(known: MapState, new: Clusters, look: _Look, task: Task) -> tuple[Clusters, Tensor]:
+def _select_new(
+    known: MapState, new: Clusters, assignment: _Assignment, task: Task
+) -> tuple[Clusters, Tensor]:
     """Select and order the new clusters, and return the rows that the first of them replace.
 
     A new cluster close to an old center lies at the boundary of an old cluster and is discarded. The
@@ -270,15 +273,15 @@ def _settle(known: MapState, new: Clusters, look: _Look, task: Task) -> tuple[Cl
     owner = native.nearest_centers(new.means, known.means, 1).squeeze(1)
     offsets = known.means[owner] - new.means
     apart = whitened(offsets, new.covariances, task.kernel.min_lengthscale) > task.config.fringe
-    kept = look.outgrown[owner] | apart
+    kept = assignment.too_coarse[owner] | apart
     new, owner = take_clusters(new, kept), owner[kept]
-    heirs = look.covered[owner]
+    inherits = assignment.covered[owner]
     total = torch.zeros_like(known.counts).index_add_(0, owner, new.counts)
-    gain = torch.where(heirs, 1 + known.counts[owner] / total[owner], 1.0).to(new.means.dtype)
+    gain = torch.where(inherits, 1 + known.counts[owner] / total[owner], 1.0).to(new.means.dtype)
     order = torch.arange(len(new), device=owner.device)
     first = torch.full_like(known.counts, len(new)).scatter_reduce(0, owner, order, "amin")
-    where = (look.covered & (first < len(new))).nonzero().squeeze(1)
-    rest = torch.ones_like(heirs).index_fill_(0, first[where], False).nonzero().squeeze(1)
+    where = (assignment.covered & (first < len(new))).nonzero().squeeze(1)
+    rest = torch.ones_like(inherits).index_fill_(0, first[where], False).nonzero().squeeze(1)
     order = torch.cat([first[where], rest])
     scatters = new.scatters * gain[:, None, None]
     return take_clusters(
