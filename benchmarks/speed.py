@@ -36,8 +36,8 @@ from timing import Contender, compare, format_comparison, format_rows
 from workers import plain_path
 
 from lardhm_torch import FitConfig, LardHilbertMap, native
-from lardhm_torch.learning.clustering import clusters_about, mini_batch_kmeans
-from lardhm_torch.learning.fitting import deal_samples, fit_weights
+from lardhm_torch.learning.clustering import clusters_from_moments, mini_batch_kmeans
+from lardhm_torch.learning.fitting import fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.points import in_morton_order
 
@@ -126,7 +126,7 @@ def train(arguments: argparse.Namespace) -> Result:
 def sgd_schedule(num_points: int) -> tuple[int, int]:
     """Passes and batch size of the defaults, for the system that trains in plain torch."""
     config = FitConfig()
-    return config.passes_over(num_points), config.rows_a_batch(num_points)
+    return config.passes_over(num_points), config.rows_per_batch(num_points)
 
 
 def paper_note(kind: str) -> str:
@@ -169,12 +169,12 @@ def stage_calls(task: Task, model: LardHilbertMap) -> dict[str, Callable[[], Any
 
     def lengthscales() -> None:
         for points, means in zip(classes, centers, strict=True):
-            clusters = clusters_about(means, *native.assign(points, means)[1:])
+            clusters = clusters_from_moments(means, *native.assign(points, means)[1:])
             factor_covariances(clusters.covariances, model.min_lengthscale)
 
     config, rng = FitConfig(), torch.Generator().manual_seed(0)
     samples = in_morton_order(task.points - model.origin.float(), task.labels)
-    local, labels = deal_samples(samples, config.rows_a_batch(len(task.points)), rng)
+    local, labels = stratified_batches(samples, config.rows_per_batch(len(task.points)), rng)
     state = (model.centers, model.raw_scale_tril, model.kernel)
     index = native.build_index(model.centers, model.num_neighbors)
 

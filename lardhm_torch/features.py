@@ -1,6 +1,7 @@
-"""The definition: k nearest centers, the LARD kernel, the sparse feature matrix.
+"""Reference implementation: k nearest centers, the LARD kernel and the sparse feature matrix.
 
-Everything here is plain torch, on any device, dtype and dimension; `native` answers the same faster.
+This module is plain torch and works on any device, dtype and dimension. `native` computes the same
+values faster.
 """
 
 from __future__ import annotations
@@ -11,20 +12,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-CHUNK_ENTRIES = 1 << 23  # distances held at a time by the exhaustive search
-KDTREE_MIN_CENTERS = 64  # below this the exhaustive search is as fast
-QUERY_CHUNK = 1 << 17  # points whose features are held at a time by a query
-FADING = 0.5  # of the k-th neighbor's squared distance: over so much of it neighbors fade out
-SPARE_CANDIDATES = 4  # neighbors asked beyond k, so that ties can be settled
+CHUNK_ENTRIES = 1 << 23  # number of distances in memory at a time in the exhaustive search
+KDTREE_MIN_CENTERS = 64  # with fewer centers the exhaustive search is as fast
+QUERY_CHUNK = 1 << 17  # number of query points processed at a time
+FADING = 0.5  # neighbors fade out over this fraction of the k-th squared distance
+SPARE_CANDIDATES = 4  # additional neighbors searched, to detect ties at rank k
 
 
 class Kernel(NamedTuple):
-    """What makes features of clusters, beside their tensors: the settings of a map.
+    """Settings of a map that determine its features, in addition to the tensors of the clusters.
 
     Args:
-        num_neighbors: k nearest clusters that answer for a point.
+        num_neighbors: k, the number of nearest clusters used per point.
         covariance_scale: factor on the clusters' covariances.
-        min_lengthscale: no kernel axis is thinner [m], before ``covariance_scale``.
+        min_lengthscale: lower bound on the standard deviation of a kernel along each axis [m],
+            before ``covariance_scale`` is applied.
     """
 
     num_neighbors: int
@@ -33,9 +35,10 @@ class Kernel(NamedTuple):
 
 
 def kernel_factors(raw_scale_tril: Tensor, kernel: Kernel) -> Tensor:
-    """(M, D, D) factors with the logarithm of their diagonals -> (M, D, D) kernel factors [m].
+    """(M, D, D) factors with log-transformed diagonals -> (M, D, D) kernel factors [m].
 
-    Any raw value gives a valid lower Cholesky factor, so that any optimizer may move it.
+    Any raw value gives a valid lower Cholesky factor, so the raw factors can be optimized without
+    constraints.
     """
     diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
     diagonal = torch.diag_embed(diagonal.clamp(min=kernel.min_lengthscale))
@@ -43,7 +46,7 @@ def kernel_factors(raw_scale_tril: Tensor, kernel: Kernel) -> Tensor:
 
 
 def raw_factors(scale_tril: Tensor) -> Tensor:
-    """(M, D, D) lower factors -> the same with the logarithm of their diagonals."""
+    """(M, D, D) lower factors -> the same factors with log-transformed diagonals."""
     diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
     return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
 
@@ -51,8 +54,8 @@ def raw_factors(scale_tril: Tensor) -> Tensor:
 def squared_distances(points: Tensor, centers: Tensor) -> Tensor:
     """(..., D) and (..., D), broadcast, -> (...) squared Euclidean distance [m^2].
 
-    The sum of squared differences, axis by axis: the expanded form |x|^2 - 2xc + |c|^2 loses all
-    digits far from the origin.
+    Squared differences are summed axis by axis, because the expanded form |x|^2 - 2xc + |c|^2
+    suffers from catastrophic cancellation far from the origin.
     """
     total = (points[..., 0] - centers[..., 0]).square()
     for axis in range(1, points.shape[-1]):
@@ -61,15 +64,15 @@ def squared_distances(points: Tensor, centers: Tensor) -> Tensor:
 
 
 def nearest_centers(points: Tensor, centers: Tensor, num_neighbors: int) -> Tensor:
-    """The nearest centers of each point, exact; of equally near ones the lower index.
+    """Exact k nearest centers of each point. Ties are resolved in favor of the lower index.
 
-    Searched by a k-d tree on the CPU, by torch-cluster on other devices where it is installed,
-    and exhaustively in chunks otherwise. No (N, M) matrix is ever held.
+    The search uses a k-d tree on the CPU, torch-cluster on other devices if it is installed, and
+    otherwise an exhaustive search in chunks. The (N, M) distance matrix is never stored as a whole.
 
     Args:
         points: (N, D) positions [m].
         centers: (M, D) cluster centers [m], same frame, dtype and device.
-        num_neighbors: how many; more than M means M.
+        num_neighbors: number of neighbors per point; values above M are reduced to M.
 
     Returns:
         (N, K) int64 indices of centers, ascending in each row, K = min(num_neighbors, M).
@@ -94,9 +97,9 @@ def _plain_nearest(points: Tensor, centers: Tensor, num_neighbors: int) -> Tenso
             candidates = _torch_cluster_candidates(points, centers, k + SPARE_CANDIDATES)
     if candidates is None:
         return _exhaustive_nearest(points, centers, k)
-    indices, settled = _closest_candidates(points, centers, candidates, k)
-    if not bool(settled.all()):
-        indices[~settled] = _exhaustive_nearest(points[~settled], centers, k)
+    indices, exact = _closest_candidates(points, centers, candidates, k)
+    if not bool(exact.all()):
+        indices[~exact] = _exhaustive_nearest(points[~exact], centers, k)
     return indices
 
 
@@ -124,17 +127,17 @@ def _torch_cluster_candidates(points: Tensor, centers: Tensor, count: int) -> Te
 def _closest_candidates(
     points: Tensor, centers: Tensor, candidates: Tensor, k: int
 ) -> tuple[Tensor, Tensor]:
-    """The k closest of each row, ties to the lower index, and which rows are certain.
+    """The k nearest candidates of each row, and a mask of the rows that are guaranteed to be exact.
 
-    A row is certain if its farthest candidate is clearly farther than its k-th: then no center
-    outside the candidates can belong to the k.
+    Ties are resolved in favor of the lower index. A row is exact if its farthest candidate is
+    clearly farther than its k-th: then no center outside the candidates can be among the k nearest.
     """
     candidates = candidates.sort(dim=1).values
     distances = squared_distances(points[:, None], centers[candidates])
     order = distances.sort(dim=1, stable=True)
     chosen = candidates.gather(1, order.indices[:, :k]).sort(dim=1).values
-    settled = order.values[:, k - 1] * (1 + 1e-5) < order.values[:, -1]
-    return chosen, settled
+    exact = order.values[:, k - 1] * (1 + 1e-5) < order.values[:, -1]
+    return chosen, exact
 
 
 def _exhaustive_nearest(points: Tensor, centers: Tensor, k: int) -> Tensor:
@@ -152,16 +155,16 @@ def _exhaustive_nearest(points: Tensor, centers: Tensor, k: int) -> Tensor:
 
 
 def lard_kernel(points: Tensor, centers: Tensor, scale_tril: Tensor, indices: Tensor) -> Tensor:
-    """Closeness of every point to its neighbors: 1 at a center, falling to 0.
+    """Kernel values between points and their neighbors: 1 at a center, decreasing to 0.
 
-    phi_m(x) = exp(-|inv(L_m) (x - c_m)|^2 / 2), with covariance L_m L_m^T. The factor is applied by
-    forward substitution, one axis after the other; nothing is inverted.
+    phi_m(x) = exp(-|inv(L_m) (x - c_m)|^2 / 2), with covariance L_m L_m^T. The triangular
+    system is solved by forward substitution; no matrix is inverted.
 
     Args:
         points: (N, D) positions [m].
         centers: (M, D) cluster centers [m].
         scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
-        indices: (N, K) which clusters to evaluate for each point.
+        indices: (N, K) clusters to evaluate for each point.
 
     Returns:
         (N, K) values in [0, 1], no unit.
@@ -182,14 +185,14 @@ def lard_kernel(points: Tensor, centers: Tensor, scale_tril: Tensor, indices: Te
 
 
 def neighbor_fade(points: Tensor, centers: Tensor, indices: Tensor) -> Tensor:
-    """How much of each neighbor's kernel is left: 1 near the point, 0 for the farthest of the k.
+    """Factor on each neighbor's kernel value: 1 for near neighbors, 0 for the farthest of the k.
 
-    With t the neighbor's squared distance over that of the farthest, u = (1 - t) / FADING, at most
-    1, and 3 u^2 - 2 u^3 is left. So a neighbor has faded out by the time that another takes its
-    place, and neither features nor their slopes jump. The paper drops neighbors with their kernels
-    open (Section II-B), and the probability jumps where it does.
+    Let t be the squared distance of a neighbor divided by that of the farthest neighbor, and
+    u = min(1, (1 - t) / FADING). The factor is 3 u^2 - 2 u^3. It is 0 where a neighbor is replaced
+    by another one, so features and their gradients are continuous. The paper truncates the sum to
+    k neighbors without such a factor (Section II-B), which makes the probability discontinuous.
 
-    Nothing fades where all clusters answer everywhere, or only one.
+    All factors are 1 if k = 1 or if all clusters are neighbors.
 
     Args:
         points: (N, D) positions [m].
@@ -211,7 +214,7 @@ def neighbor_fade(points: Tensor, centers: Tensor, indices: Tensor) -> Tensor:
 def nearest_features(
     points: Tensor, centers: Tensor, scale_tril: Tensor, num_neighbors: int
 ) -> tuple[Tensor, Tensor]:
-    """(N, K) indices of the nearest clusters, ascending, and (N, K) their faded kernel values.
+    """(N, K) ascending indices of the nearest clusters, and (N, K) kernel values times the fade.
 
     Source: Guizilini & Ramos 2016, eq. (9) with Section II-B: all other values are zero.
     """
@@ -221,7 +224,7 @@ def nearest_features(
 
 
 def feature_matrix(indices: Tensor, values: Tensor, num_clusters: int) -> Tensor:
-    """(N, K) indices and values -> coalesced sparse COO (N, M), for `torch.sparse.mm`."""
+    """(N, K) indices and values -> coalesced sparse COO matrix (N, M), for `torch.sparse.mm`."""
     rows = torch.arange(len(indices), device=indices.device)[:, None].expand_as(indices)
     coordinates = torch.stack([rows.reshape(-1), indices.reshape(-1)])
     return torch.sparse_coo_tensor(
@@ -236,12 +239,12 @@ def feature_matrix(indices: Tensor, values: Tensor, num_clusters: int) -> Tensor
 def log_odds(
     points: Tensor, centers: Tensor, scale_tril: Tensor, weights: Tensor, num_neighbors: int
 ) -> Tensor:
-    """(N, D) positions [m] -> (N,) log-odds of occupied, w^T Phi(x); NaN where a point is not finite.
+    """(N, D) positions [m] -> (N,) log-odds of occupied, w^T Phi(x); NaN for non-finite points.
 
     Source: Guizilini & Ramos 2016, eq. (1).
     """
     chunks = []
-    whole = torch.compiler.is_compiling()  # an exported map takes any number of points
+    whole = torch.compiler.is_compiling()  # the exported graph must accept any number of points
     for chunk in [points] if whole else points.split(QUERY_CHUNK):
         indices, values = nearest_features(chunk, centers, scale_tril, num_neighbors)
         total = (values * weights[indices]).sum(dim=1)

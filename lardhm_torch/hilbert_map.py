@@ -1,4 +1,4 @@
-"""The map: a torch module that answers queries and learns from labelled points."""
+"""LARD Hilbert map as a torch module: queries, training and map files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from lardhm_torch.sampling import seeded_generator
 
 
 class LardHilbertMap(parameters.MapParameters):
-    """Continuous occupancy: a weighted sum of local kernel features gives the log-odds.
+    """Continuous occupancy map whose log-odds are a weighted sum of local kernel features.
 
-    An empty map, and any place far from every cluster, has probability exactly 1/2. Points are
+    The probability is exactly 1/2 in an empty map and far from all clusters. Points are
     given in the world frame; ``origin`` is subtracted in float64 before they are cast to the map's
     dtype, so coordinates may be far from zero. A point with a NaN or infinite coordinate has
     probability NaN. Tensors, NumPy arrays and lists are accepted as points.
@@ -35,19 +35,19 @@ class LardHilbertMap(parameters.MapParameters):
         covariance_scale: factor on the covariances of the clusters.
         min_lengthscale: smallest standard deviation of a kernel along any axis [m], before
             ``covariance_scale``.
-        device: where the tensors are; None: torch's default.
+        device: device of the tensors; None: torch's default.
         dtype: floating point type of the tensors; None: torch's default.
 
     Attributes:
-        weights: (M,) parameter, learned.
+        weights: (M,) parameter, weights of the features.
         centers: (M, D) parameter [m], map frame.
-        raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with the logarithm of their
-            diagonals: any value is a valid factor. `scale_tril` is the kernel's.
+        raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with log-transformed diagonals, so
+            that any value is valid. `scale_tril` holds the factors of the kernels [m].
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
             clusters of unknown points have count 0.
-        posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; variance
-            0 for clusters that it has not seen.
-        posterior_scales: (2,) buffer, factors on negative and on positive posterior log-odds.
+        posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; a variance
+            of 0 means that the posterior has not been computed.
+        posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
@@ -64,7 +64,7 @@ class LardHilbertMap(parameters.MapParameters):
         return self._query(points, probability=False)
 
     def features(self, points: TensorLike) -> Tensor:
-        """(N, D) world positions [m] -> sparse COO (N, M), K kernel values a row, eq. (9)."""
+        """(N, D) world positions [m] -> sparse COO (N, M) with K values per row, eq. (9)."""
         local = self._to_map_frame(points)
         if local.ndim != 2:
             raise ValueError(f"points must be (N, {self.dim}); got {tuple(local.shape)}")
@@ -76,7 +76,9 @@ class LardHilbertMap(parameters.MapParameters):
         return feature_matrix(indices, values, len(self))
 
     def variance(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) variance of the log-odds; the prior's where unseen.
+        """(..., D) world positions [m] -> (...) variance of the log-odds.
+
+        Far from all clusters it equals the variance of the prior.
 
         Raises:
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
@@ -84,20 +86,20 @@ class LardHilbertMap(parameters.MapParameters):
         return self._posterior(points)[1]
 
     def bayesian_probability(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) probability that accounts for the weights' variance.
+        """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
 
         Raises:
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
         mean, variance = self._posterior(points)
-        return posterior.moderate(mean, posterior.OWN_SHARE * variance)
+        return posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance)
 
     @torch.no_grad()
     def unknown(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) how little was seen there, from 0 to 1.
+        """(..., D) world positions [m] -> (...) degree to which space is unobserved, 0 to 1.
 
-        1 minus the largest feature of a cluster of occupied or free points. Where the probability is
-        near 1/2, a value near 0 means contradictory data and a value near 1 means no data.
+        The value is 1 minus the largest feature among clusters of occupied or free points. Where the
+        probability is near 1/2, values near 0 indicate contradictory data, values near 1 no data.
         """
         local = self._to_map_frame(points)
         flat = local.reshape(-1, self.dim)
@@ -112,14 +114,14 @@ class LardHilbertMap(parameters.MapParameters):
 
     @torch.no_grad()
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """Probability, or log-odds, at all points of a lattice: faster than point by point.
+        """Probability or log-odds at all points of a lattice. Faster than querying the points.
 
         Args:
-            axes: D lists of world coordinates [m]; all their combinations are the points.
-            probability: False: log-odds.
+            axes: D lists of world coordinates [m]; the lattice is their Cartesian product.
+            probability: True: return the probability; False: return the log-odds.
 
         Returns:
-            (len(axes[0]), len(axes[1]), ...) without gradient.
+            (len(axes[0]), len(axes[1]), ...) values without gradient.
 
         Raises:
             ValueError: axes are not D lists of finite coordinates.
@@ -135,12 +137,12 @@ class LardHilbertMap(parameters.MapParameters):
 
     @torch.no_grad()
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
-        """`raycasting.raycast` by the native kernel; None where it does not support this map.
+        """`raycasting.raycast` in the native library; None if it does not support this map.
 
         Args:
             origins: (R, D) world positions, float64 [m].
-            directions: (R, D) of length 1, float64.
-            march: as for `native.raycast`.
+            directions: (R, D) unit vectors, float64.
+            march: parameters of `native.raycast`.
         """
         if len(self) == 0 or not native.supports(self.centers):
             return None
@@ -181,11 +183,11 @@ class LardHilbertMap(parameters.MapParameters):
         )
 
     def _fresh_index(self) -> Tensor:
-        """The index of the neighbor search, rebuilt whenever the centers have changed."""
-        if torch.compiler.is_compiling():  # no branch on values; the operators check it themselves
+        """Index of the neighbor search. It is rebuilt if the centers have changed."""
+        if torch.compiler.is_compiling():  # the operators check the index themselves
             return self._index
         if not native.index_matches(self._index, self.centers, self.num_neighbors):
-            with torch.inference_mode(False):  # an inference tensor could never serve training
+            with torch.inference_mode(False):  # inference tensors cannot be used in training
                 self._index = native.build_index(self.centers, self.num_neighbors)
         return self._index
 
@@ -206,19 +208,19 @@ class LardHilbertMap(parameters.MapParameters):
         config: FitConfig | None = None,
         progress: bool = False,
     ) -> LardHilbertMap:
-        """Learn the map from labelled points; what it knew before is forgotten.
+        """Fit the map to labelled points. Existing clusters are discarded.
 
-        Each class is clustered on its own, the moments of the clusters give centers and
-        length-scales, then the weights are trained. If anything fails, the map is unchanged.
+        Each class is clustered separately. The moments of the clusters determine centers and
+        length-scales, and then the weights are trained. If anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m].
-            labels: (N,) 1 occupied, 0 free, 1/2 unknown; one class alone is allowed.
+            labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
-                leaves the rest to the other. None: chosen from the data
+                leaves the remainder to the other. None: chosen from the data
                 (`clustering.choose_num_clusters`).
             seed: random seed of clustering and training.
-            config: how the weights are trained.
+            config: training settings of the weights.
             progress: show a progress bar on a terminal.
 
         Returns:
@@ -242,9 +244,9 @@ class LardHilbertMap(parameters.MapParameters):
     def fit_uncertainty(self, points: TensorLike, labels: TensorLike) -> LardHilbertMap:
         """Estimate the variance of the weights, for `variance` and `bayesian_probability`.
 
-        Probability and log-odds stay as they are, and as fast. Call it after the last `fit`,
-        `fine_tune` or `update`, with the points the map was trained on: the posterior belongs to
-        the weights it was computed for.
+        Probability and log-odds do not change. Call this method after the last `fit`, `fine_tune` or
+        `update`, with the points the map was trained on, because the posterior is valid only for
+        the current weights.
 
         Args:
             points: (N, D) world positions [m].
@@ -254,7 +256,7 @@ class LardHilbertMap(parameters.MapParameters):
             This map.
 
         Raises:
-            ValueError: the map is empty, or the samples are bad (see `fit`).
+            ValueError: the map is empty, or the samples are invalid (see `fit`).
         """
         if len(self) == 0:
             raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
@@ -272,20 +274,21 @@ class LardHilbertMap(parameters.MapParameters):
         seed: int = 0,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
-        """Learn from one more scan and keep what is known; on an empty map the same as `fit`.
+        """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
 
-        New points join the clusters that explain them, the others form new ones; then the weights
-        near the scan are trained on the new points and on pseudo-samples drawn from the clusters.
-        Parameters stay the same objects (see `parameters.resize_optimizer` for an optimizer with a
-        state). If anything fails, the map is unchanged.
+        New points are assigned to existing clusters near them; the remaining points form new
+        clusters. The weights near the scan are then trained on the new points and on pseudo-samples
+        drawn from the existing clusters. Parameters remain the same objects (see
+        `parameters.resize_optimizer` for stateful optimizers). If anything fails, the map is
+        unchanged.
 
         Args:
             points: (N, D) world positions [m]; an empty set leaves the map unchanged.
             labels: (N,) 1 occupied, 0 free.
-            num_clusters: total over both classes if nothing were known yet; points that existing
-                clusters explain form no new ones. None: chosen from the data.
+            num_clusters: total over both classes for a scan of an unmapped place; points that are
+                assigned to existing clusters form no new ones. None: chosen from the data.
             seed: random seed of clustering and training.
-            config: `UpdateConfig(as_in_paper=True, replay=0)` is the paper's own rule.
+            config: update settings; `UpdateConfig(as_in_paper=True, replay=0)` follows the paper.
 
         Returns:
             This map.
@@ -309,9 +312,10 @@ class LardHilbertMap(parameters.MapParameters):
         return self
 
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
-        """Move the map rigidly: what it said of x, it then says of rotation x + translation.
+        """Apply the rigid transform x -> rotation x + translation to the map.
 
-        Exact, without training: after a loop closure a submap can be moved to its new pose.
+        The transform is exact and needs no training, so that a submap can be moved to its new pose
+        after a loop closure.
 
         Args:
             rotation: (D, D) orthonormal, determinant 1.
@@ -342,9 +346,9 @@ class LardHilbertMap(parameters.MapParameters):
         return self
 
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
-        """Groups for an optimizer, with weight decay on the weights alone.
+        """Parameter groups for an optimizer, with weight decay on the weights only.
 
-        Decay would pull centers to the map's origin and length-scales to 1 m.
+        Weight decay would pull centers to the map's origin and length-scales to 1 m.
         """
         return [
             {"params": [self.weights], "weight_decay": weight_decay},
@@ -354,16 +358,16 @@ class LardHilbertMap(parameters.MapParameters):
     # --- files ---
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the map to a file, atomically: `torch.save(model.state_dict(), path)`, but safe."""
+        """Write the state dict of the map to a file, atomically."""
         map_files.save_state(self.state_dict(), path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:
-        """Read a map file, whether `save` or `torch.save(model.state_dict(), ...)` wrote it.
+        """Read a map file written by `save` or by `torch.save(model.state_dict(), ...)`.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is not a map, is damaged, unsafe, or of a newer format.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is not a map, is damaged or unsafe, or has a newer format.
         """
         state = map_files.load_state(path)
         try:

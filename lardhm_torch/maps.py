@@ -1,8 +1,8 @@
 """The interface of an occupancy map, as queries, surfaces and viewers use it.
 
-Every object with the members of `OccupancyMap` is a map: `LardHilbertMap`, `TiledMap`, or a class of
-your own. Some maps offer more, for speed or because they do not fit in memory. The functions below
-use these optional members where a map has them, and no other module checks for them.
+Any object with the members of `OccupancyMap` is a map: `LardHilbertMap`, `TiledMap`, or a user-defined
+class. Some maps have optional members, for speed or because they do not fit in memory. The functions
+below use these members if they are present; no other module checks for them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-TensorLike: TypeAlias = Tensor | np.ndarray | Sequence[object]  # whatever `to_tensor` converts
+TensorLike: TypeAlias = Tensor | np.ndarray | Sequence[object]  # types accepted by `to_tensor`
 
 
 class OccupancyMap(Protocol):
     """A map of M Gaussian kernels in D dimensions.
 
-    Positions in the world frame are ``origin`` plus positions in the map frame.
+    World coordinates are ``origin`` plus map coordinates.
     """
 
     @property
@@ -52,12 +52,12 @@ class OccupancyMap(Protocol):
 
 
 def to_tensor(values: TensorLike, name: str, device: torch.device | str | None = None) -> Tensor:
-    """Convert a tensor, an array or nested lists to a float64 tensor; gradients are kept.
+    """Convert a tensor, an array or nested lists to a float64 tensor. Gradients are preserved.
 
     Args:
         values: numbers.
-        name: of the argument, for the error.
-        device: of the result; None: that of a tensor, else the CPU.
+        name: name of the argument, for error messages.
+        device: device of the result; None: the device of a tensor, otherwise the CPU.
 
     Raises:
         ValueError: values are not numbers, or nested lists differ in length.
@@ -79,7 +79,7 @@ def to_tensor(values: TensorLike, name: str, device: torch.device | str | None =
 
 
 def pieces(model: OccupancyMap) -> Iterable[OccupancyMap]:
-    """Maps that together hold every cluster once: the tiles of a tiled map, or the map itself."""
+    """Maps that together contain every cluster once: the tiles of a tiled map, or the map itself."""
     return model.pieces() if hasattr(model, "pieces") else (model,)
 
 
@@ -88,8 +88,8 @@ def local_parts(
 ) -> Iterator[tuple[Tensor, OccupancyMap]]:
     """Split N boxes into groups, each with a map that is exact inside the boxes of the group.
 
-    A tiled map groups boxes that are near each other and loads only the tiles that they need. Any
-    other map is returned once, with all boxes.
+    A tiled map groups nearby boxes and loads only the tiles that they need. Any other map yields a
+    single group with all boxes.
 
     Args:
         model: the map.
@@ -106,17 +106,17 @@ def local_parts(
 
 
 def num_neighbors(model: OccupancyMap) -> int:
-    """Number k of nearest clusters that contribute at a point; all of them if the map has no k."""
+    """Number k of nearest clusters used per point; the number of clusters if the map has no k."""
     return model.num_neighbors if hasattr(model, "num_neighbors") else len(model.weights)
 
 
 def covariance_scale(model: OccupancyMap) -> float:
-    """Kernel covariance divided by the covariance of a cluster's points; 1 if not stated."""
+    """Kernel covariance divided by the covariance of a cluster's points; 1 if the map has none."""
     return getattr(model, "covariance_scale", 1.0)
 
 
 def native_lattice(model: OccupancyMap, axes: list[Tensor], probability: bool) -> Tensor | None:
-    """Probability, or log-odds, on a lattice by the map's own ``query_lattice``; None without it."""
+    """Probability or log-odds on a lattice by the map's ``query_lattice``; None if it has none."""
     if not hasattr(model, "query_lattice"):
         return None
     return model.query_lattice(axes, probability=probability)
@@ -128,14 +128,14 @@ def native_ranges(
     directions: Tensor,
     march: tuple[float, float, float, float, bool],
 ) -> Tensor | None:
-    """(R,) ranges of rays by the map's own ``query_rays``; None where that is not available."""
+    """(R,) ranges of rays by the map's ``query_rays``; None if it is not available."""
     if getattr(model, "query_rays", None) is None:
         return None
     return model.query_rays(origins, directions, march)  # type: ignore[attr-defined]
 
 
 def stored_thickness_counts(model: OccupancyMap) -> Mapping[int, int] | None:
-    """Histogram of kernel thicknesses that a tiled map keeps in its manifest; None for others."""
+    """Histogram of kernel thicknesses in the manifest of a tiled map; None for other maps."""
     return model.thickness_counts() if hasattr(model, "thickness_counts") else None
 
 
@@ -152,6 +152,6 @@ def log_odds_variance(model: OccupancyMap, points: Tensor) -> Tensor:
 
 
 def snapshot(model: OccupancyMap) -> OccupancyMap:
-    """An independent copy in memory, without gradients; a tiled map is merged."""
+    """An independent in-memory copy without gradients; a tiled map is merged into one map."""
     whole = model.merge() if hasattr(model, "merge") else copy.deepcopy(model)
     return whole.requires_grad_(False) if hasattr(whole, "requires_grad_") else whole

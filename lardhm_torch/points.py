@@ -1,4 +1,4 @@
-"""Positions on their way into a map: checked, in the map's frame, in Morton order."""
+"""Preparation of points for a map: validation, conversion to the map frame, Morton order."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.maps import TensorLike, to_tensor
 
-CHECK_CHUNK = 1 << 18  # labels checked at a time, so that the check needs little memory
-STRAY = 100.0  # times the spread of the middle 98 % of the points: farther ones are left out
-STRAY_SAMPLE = 1 << 14  # points from which the spread is estimated
-UNKNOWN = 0.5  # label of a point where no ray was
-FRAME_CHUNK = 1 << 14  # points moved to the map's frame at a time: they stay in the cache
+CHECK_CHUNK = 1 << 18  # number of labels checked at a time, to limit memory
+OUTLIER_FACTOR = (
+    100.0  # outlier threshold, as a multiple of the spread of the middle 98 % of points
+)
+OUTLIER_SAMPLE = 1 << 14  # number of points used to estimate the spread
+UNKNOWN = 0.5  # label of points in unobserved space
+FRAME_CHUNK = 1 << 14  # number of points converted at a time; a chunk fits into the CPU cache
 
 
 class TrainingPoints(NamedTuple):
-    """(N, D) points in the map's frame [m], (N,) labels, and the frame's origin (D,) float64 [m]."""
+    """(N, D) points in the map frame [m], (N,) labels, and (D,) float64 origin of that frame [m]."""
 
     points: Tensor
     labels: Tensor
@@ -31,17 +33,17 @@ class TrainingPoints(NamedTuple):
 def training_points(
     points: TensorLike, labels: TensorLike, like: Tensor, origin: Tensor | None = None
 ) -> TrainingPoints:
-    """Checked samples in a map's frame and dtype; in Morton order where the frame is new.
+    """Validate samples and convert them to the frame and dtype of a map.
 
     Args:
         points: (N, D) world positions [m], at least one.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown; unknown points serve a new map only.
-        like: (M, D) tensor of the map, for its dimension, dtype and device.
-        origin: (D,) float64, the map's origin [m]. None: a new frame around the points, in whole
-            meters, with the points sorted along the Morton curve.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown; unknown points are dropped if ``origin`` is given.
+        like: (M, D) tensor of the map that defines dimension, dtype and device.
+        origin: (D,) float64, the map's origin [m]. None: use the mean of the points, rounded to
+            whole meters, and sort the points in Morton order.
 
     Raises:
-        ValueError: as `check_samples`.
+        ValueError: the samples are invalid, see `check_samples`.
     """
     points, labels = check_samples(
         points, labels, like.shape[1], like.device, keep_unknown=origin is None
@@ -49,16 +51,16 @@ def training_points(
     labels = labels.to(like.dtype)
     if origin is not None:
         return TrainingPoints(to_map_frame(points, origin, like.dtype), labels, origin)
-    points, labels = _drop_strays(points, labels)
+    points, labels = _drop_outliers(points, labels)
     origin = points.mean(dim=0, dtype=torch.float64).round()
     local = to_map_frame(points, origin, like.dtype)
     local, labels = in_morton_order(local, labels)
     return TrainingPoints(local, labels, origin)
 
 
-def _drop_strays(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """The samples without strays, with warnings where there are strays or no occupied points."""
-    kept = _without_strays(points)
+def _drop_outliers(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Remove outliers. Warn if there are outliers, or if no point is occupied."""
+    kept = _inliers(points)
     if not bool(kept.all()):
         warnings.warn(
             f"left out {int((~kept).sum())} of {len(points)} points that are far from all others; "
@@ -75,23 +77,23 @@ def _drop_strays(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     return points, labels
 
 
-def _without_strays(points: Tensor) -> Tensor:
-    """(N,) bool: False for points so far from all others that they would spoil the order of those.
+def _inliers(points: Tensor) -> Tensor:
+    """(N,) mask that is False for outliers, which would degrade the Morton order of all other points.
 
-    A stray lies more than `STRAY` times the spread of the middle 98 % of the points from their
-    median, along some axis.
+    A point is an outlier if, along any axis, it is farther from the median than `OUTLIER_FACTOR`
+    times the spread of the middle 98 % of the points.
 
     Args:
         points: (N, D) positions [m], finite.
     """
-    every = points[:: max(1, len(points) // STRAY_SAMPLE)].double()
-    low, middle, high = every.quantile(every.new_tensor([0.01, 0.5, 0.99]), dim=0)
-    reach = STRAY * (high - low).max()
-    if not bool(reach > 0):
+    subset = points[:: max(1, len(points) // OUTLIER_SAMPLE)].double()
+    low, middle, high = subset.quantile(subset.new_tensor([0.01, 0.5, 0.99]), dim=0)
+    limit = OUTLIER_FACTOR * (high - low).max()
+    if not bool(limit > 0):
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
-    low, high = (middle - reach).to(points), (middle + reach).to(points)
+    low, high = (middle - limit).to(points), (middle + limit).to(points)
     lower, upper = points.aminmax(dim=0)
-    if bool((lower >= low).all()) and bool((upper <= high).all()):  # as almost always
+    if bool((lower >= low).all()) and bool((upper <= high).all()):  # the common case
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     return ((points >= low) & (points <= high)).all(dim=1)
 
@@ -104,13 +106,13 @@ def check_samples(
     *,
     keep_unknown: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Samples as (N, D) points and (N,) labels on a device; arrays and lists are converted.
+    """Validate samples and convert them to (N, D) points and (N,) labels on a device.
 
-    Unknown points, of label 1/2, are left out unless ``keep_unknown`` asks for them.
+    Unknown points (label 1/2) are dropped unless ``keep_unknown`` is True.
 
     Raises:
         ValueError: wrong shapes, no points, NaN or infinite points, labels not 0, 1/2 or 1, or
-            nothing but unknown points.
+            all points are unknown.
     """
     points, labels = (
         as_tensor(values, name, device).detach()
@@ -124,17 +126,17 @@ def check_samples(
         )
     if len(points) == 0:
         raise ValueError("points must hold at least one point; got 0")
-    # The sum needs no memory and is finite only if every coordinate is.
+    # The sum needs no extra memory, and is non-finite if any coordinate is non-finite.
     bad = points.new_zeros(0) if bool(points.sum().isfinite()) else ~points.isfinite().all(dim=1)
     if bool(bad.any()):
         raise ValueError(
             f"points must be finite; got {int(bad.sum())} rows with NaN or infinity, "
             f"the first at row {int(bad.nonzero()[0])}. Drop them: points[points.isfinite().all(1)]"
         )
-    strange = next((c for c in labels.split(CHECK_CHUNK) if not _are_labels(c)), None)
-    if strange is not None:
-        wrong = (strange != 0) & (strange != 1) & (strange != UNKNOWN)
-        value = strange[wrong][0].item()
+    invalid = next((c for c in labels.split(CHECK_CHUNK) if not _are_labels(c)), None)
+    if invalid is not None:
+        wrong = (invalid != 0) & (invalid != 1) & (invalid != UNKNOWN)
+        value = invalid[wrong][0].item()
         cure = " From {-1, +1}: labels = (labels + 1) / 2." if value == -1 else ""
         raise ValueError(f"labels must be 0 or 1; got {value}. 1/2 means unknown.{cure}")
     known = labels != UNKNOWN
@@ -153,16 +155,16 @@ def _are_labels(values: Tensor) -> bool:
 
 
 def in_morton_order(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
-    """(N, D) points and (N, ...) columns that belong to them, sorted by `morton_order`.
+    """Sort (N, D) points and their (N, ...) columns in Morton order.
 
-    Neighbors in space are then close in memory, which speeds up everything that follows.
+    Points that are close in space are then close in memory, which speeds up all later steps.
     """
     order = morton_order(points)
     return tuple(column.index_select(0, order) for column in (points, *columns))
 
 
 def morton_order(points: Tensor) -> Tensor:
-    """(N, D) positions -> (N,) int64 rows in the order of their Morton codes."""
+    """(N, D) positions -> (N,) int64 indices that sort them by their Morton codes."""
     if native.supports(points):
         return torch.ops.lardhm.z_order(points)
     bits = min(10, 62 // points.shape[1])
@@ -177,7 +179,7 @@ def morton_order(points: Tensor) -> Tensor:
 
 
 def as_tensor(values: TensorLike, name: str, device: torch.device) -> Tensor:
-    """A tensor or array on the device, of its own dtype; lists become float64.
+    """Convert to a tensor on a device. Tensors and arrays keep their dtype; lists become float64.
 
     Raises:
         ValueError: values are not numbers, or nested lists differ in length.
@@ -205,16 +207,17 @@ def check_axes(axes: Sequence[Tensor], dim: int) -> None:
 
 
 def to_map_frame(points: Tensor, origin: Tensor, dtype: torch.dtype) -> Tensor:
-    """(..., D) world positions -> positions relative to an origin in whole meters, in that dtype.
+    """(..., D) world positions -> (..., D) positions relative to the origin, cast to ``dtype``.
 
-    Whole meters are exact in float32 too, so float32 points lose nothing.
+    The origin is in whole meters, which are exact in float32 too, so the subtraction of float32
+    points loses no precision.
     """
     working = torch.promote_types(torch.promote_types(points.dtype, dtype), torch.float32)
     shift = origin.to(working)
     plain = working == dtype or points.ndim != 2 or points.requires_grad
     if plain or torch.compiler.is_compiling():
         return (points.to(working) - shift).to(dtype)
-    local = points.new_empty(points.shape, dtype=dtype)  # in chunks: no large temporary
+    local = points.new_empty(points.shape, dtype=dtype)  # chunks avoid a large temporary
     shift = shift.expand(min(FRAME_CHUNK, len(points)), -1).contiguous()
     for to, part in zip(local.split(FRAME_CHUNK), points.split(FRAME_CHUNK), strict=True):
         to.copy_(part - shift[: len(part)])

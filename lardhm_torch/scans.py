@@ -1,4 +1,4 @@
-"""Range scans: where the sensor stood and where its rays ended, in one world frame."""
+"""Range scans: sensor positions and ray ends in a common world frame."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Scans:
-    """Rays of one or more scans, world frame, float64.
+    """Rays of one or more scans, in the world frame, as float64.
 
-    Ray r goes from ``origins[scan_id[r]]`` to ``ends[r]``. Coordinates may be far from zero (UTM).
+    Ray r goes from ``origins[scan_id[r]]`` to ``ends[r]``. Coordinates may be far from zero (e.g. UTM).
 
     Args:
         origins: (S, D) sensor position of each scan [m].
-        ends: (R, D) end of each ray [m]: a hit, or a point up to which the beam met nothing.
-        scan_id: (R,) which scan a ray belongs to, 0 to S - 1; left out: all belong to scan 0.
-        is_return: (R,) True where the ray hit a surface; left out: all did.
-        target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; left out: all 1.
+        ends: (R, D) end of each ray [m]: a hit, or a point up to which the ray is free.
+        scan_id: (R,) scan of each ray, 0 to S - 1; None: all rays belong to scan 0.
+        is_return: (R,) True where the ray hit a surface; None: all rays did.
+        target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; None: all 1.
 
     Raises:
         ValueError: a tensor has the wrong shape, or a scan_id has no origin.
@@ -79,7 +79,7 @@ class Scans:
 
     @property
     def ray_origins(self) -> Tensor:
-        """(R, D) where each ray starts [m]."""
+        """(R, D) start of each ray [m]."""
         return self.origins[self.scan_id]
 
     @property
@@ -90,11 +90,11 @@ class Scans:
 
     @property
     def hits(self) -> Tensor:
-        """(H, D) the ray ends that lie on a surface [m]."""
+        """(H, D) ray ends that lie on a surface [m]."""
         return self.ends[self.is_return]
 
     def select(self, rays: Tensor) -> Scans:
-        """The given rays (mask or indices), with all origins kept so that scan_id keeps its meaning."""
+        """The given rays (mask or indices). All origins are kept, so scan_id remains valid."""
         return Scans(
             self.origins,
             self.ends[rays],
@@ -104,10 +104,10 @@ class Scans:
         )
 
     def drop_constant_column(self) -> Scans:
-        """The same scans without their last column, which must be constant: z of a 2-D log.
+        """The same scans without the last coordinate, which must be constant, such as z of a 2-D log.
 
         Raises:
-            ValueError: the last column is not constant, so dropping it would lose something.
+            ValueError: the last coordinate is not constant.
         """
         ends, origins = self.ends, self.origins
         column = torch.cat([ends[:, -1], origins[:, -1]])
@@ -120,10 +120,10 @@ class Scans:
 
 
 def concatenate_scans(parts: list[Scans]) -> Scans:
-    """All rays of several Scans in order, scan numbers counted on.
+    """Concatenate the rays of several Scans. Scan numbers are renumbered consecutively.
 
     Raises:
-        ValueError: there are none, or their dimensions differ.
+        ValueError: ``parts`` is empty, or the dimensions differ.
     """
     if not parts:
         raise ValueError("parts must hold at least one Scans; got none")

@@ -1,7 +1,8 @@
-"""A furnished room of 40 m² and three laser scanners in it; the true surface is known.
+"""Simulation of three laser scanners in a furnished room of 40 m² with a known surface.
 
-The room is made of boxes, upright cylinders and spheres inside a box-shaped shell with a doorway and
-a window, so that rays meet it in closed form and the ground-truth mesh is the same list of shapes.
+The room consists of boxes, upright cylinders and spheres inside a box-shaped shell with a doorway and
+a window. Ray intersections are computed in closed form, and the ground-truth mesh is built from the
+same shapes.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z of the lower and the upper corner
 
-ROOM = (8.0, 5.0, 2.6)  # [m] the shell spans (0, 0, 0) to here
+ROOM = (8.0, 5.0, 2.6)  # [m] upper corner of the shell; the lower corner is (0, 0, 0)
 MAX_RANGE = 10.0  # [m] length of a beam that leaves through an opening
-MAX_ELEVATION = math.radians(75)  # the scanners see neither straight up nor their own foot
+MAX_ELEVATION = math.radians(75)  # limit of the vertical field of view, up and down
 SCANNERS = ((1.7, 3.1, 1.35), (4.4, 0.8, 1.6), (6.4, 3.6, 1.2))  # [m]
 
 
 class Opening(NamedTuple):
-    """A hole in the wall where coordinate ``axis`` is 0 or largest; it spans u along the wall, and z."""
+    """A rectangular opening: u along the wall, z in height; ``far``: the wall at the upper bound."""
 
     axis: int
     far: bool
@@ -43,14 +44,14 @@ OPENINGS = (
 
 
 def _table(x: float, y: float, width: float, depth: float) -> list[Box]:
-    """A top on four legs; its lower corner stands at (x, y)."""
+    """A table top on four legs, with its lower corner at (x, y)."""
     legs = [(x + i * (width - 0.07), y + j * (depth - 0.07)) for i in (0, 1) for j in (0, 1)]
     top = (x, y, 0.71, x + width, y + depth, 0.75)
     return [top, *((a, b, 0.0, a + 0.07, b + 0.07, 0.71) for a, b in legs)]
 
 
 def _chair(x: float, y: float, back_at: float) -> list[Box]:
-    """A seat of 0.44 m on four legs, its back at the lower (0) or the upper (1) y side."""
+    """A seat of 0.44 m on four legs, with the backrest on the lower (0) or upper (1) side in y."""
     legs = [(x + i * 0.39, y + j * 0.39) for i in (0, 1) for j in (0, 1)]
     seat = (x, y, 0.42, x + 0.44, y + 0.44, 0.47)
     back = (x, y + back_at * 0.39, 0.47, x + 0.44, y + back_at * 0.39 + 0.05, 0.95)
@@ -58,13 +59,13 @@ def _chair(x: float, y: float, back_at: float) -> list[Box]:
 
 
 def _sofa() -> list[Box]:
-    """Base, back and two arms, along the wall y = 5."""
+    """Base, backrest and two armrests, placed along the wall y = 5."""
     arms = [(x, 4.1, 0.0, x + 0.2, 5.0, 0.62) for x in (0.5, 2.5)]
     return [(0.7, 4.1, 0.0, 2.5, 5.0, 0.42), (0.7, 4.75, 0.42, 2.5, 5.0, 0.85), *arms]
 
 
 def _shelf() -> list[Box]:
-    """Two sides and five boards against the wall x = 8, open to the back."""
+    """Two sides and five boards against the wall x = 8, without a back panel."""
     sides = [(7.65, y, 0.0, 8.0, y + 0.05, 2.0) for y in (3.0, 4.55)]
     boards = [(7.65, 3.05, z, 8.0, 4.55, z + 0.04) for z in (0.1, 0.55, 1.0, 1.45, 1.96)]
     return [*sides, *boards]
@@ -96,20 +97,20 @@ SPHERES = ((0.6, 3.7, 1.55, 0.2), (6.0, 4.7, 1.0, 0.2))  # shade of the lamp, gl
 
 
 def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) -> Scans:
-    """Rays of three laser scanners in a furnished room of 8 m x 5 m x 2.6 m.
+    """Simulate three laser scanners in a furnished room of 8 m x 5 m x 2.6 m.
 
-    Each scanner sends its third of the rays evenly over all directions up to 75 degrees above and
-    below the horizon (a spherical spiral, turned at random). Beams through the doorway or the window
-    do not return: ``is_return`` is False and they end after 10 m.
+    Each scanner emits one third of the rays, evenly distributed over all directions up to 75 degrees
+    above and below the horizon (a spherical spiral with a random rotation). Rays through the doorway
+    or the window do not return: ``is_return`` is False, and they end after 10 m.
 
     Args:
-        num_rays: rays of all scanners together.
-        noise: standard deviation of the range [m], Gaussian, along the beam. The paper writes
-            sigma² = N(0, 0.1), which leaves the unit open; 0.02 m is that of a common laser scanner.
-        seed: of the spirals' turn and of the noise.
+        num_rays: total number of rays.
+        noise: standard deviation of the Gaussian range noise [m]. The paper writes
+            sigma² = N(0, 0.1), which leaves the unit open; 0.02 m is typical of laser scanners.
+        seed: random seed of the rotations of the spirals and of the noise.
 
     Returns:
-        Scans with three origins, world frame.
+        Scans with three origins, in the world frame.
 
     Raises:
         ValueError: num_rays is below 3, or noise is negative.
@@ -122,9 +123,9 @@ def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) ->
         raise ValueError(f"noise must be >= 0 m; got {noise}")
     rng = torch.Generator().manual_seed(seed)
     origins = torch.tensor(SCANNERS, dtype=torch.float64)
-    shares = [(num_rays + i) // len(SCANNERS) for i in range(len(SCANNERS))]
-    scan_id = torch.repeat_interleave(torch.arange(len(SCANNERS)), torch.tensor(shares))
-    directions = torch.cat([_spiral(share, rng) for share in shares])
+    counts = [(num_rays + i) // len(SCANNERS) for i in range(len(SCANNERS))]
+    scan_id = torch.repeat_interleave(torch.arange(len(SCANNERS)), torch.tensor(counts))
+    directions = torch.cat([_spiral(count, rng) for count in counts])
     ranges = true_ranges(origins[scan_id], directions)
     is_return = ranges.isfinite()
     error = noise * torch.randn(num_rays, generator=rng, dtype=torch.float64)
@@ -161,10 +162,10 @@ def true_ranges(origins: Tensor, directions: Tensor) -> Tensor:
 
 
 def room_mesh() -> trimesh.Trimesh:
-    """The true surface of the room: shell and furniture, normals into the free space.
+    """Ground-truth mesh of the room: shell and furniture, with normals pointing into free space.
 
-    Faces of furniture that lie on the shell (the underside of a sofa) are left out. Shapes that touch
-    or enter each other stay whole: the parts inside are never hit by a ray.
+    Furniture faces that lie on the shell (such as the underside of a sofa) are omitted. Shapes that
+    touch or overlap are not cut: no ray hits the faces inside another shape.
     """
     import trimesh
 
@@ -186,7 +187,7 @@ def room_mesh() -> trimesh.Trimesh:
 
 
 def _join(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """All faces in one mesh; nothing is merged."""
+    """Concatenate meshes without merging vertices."""
     import trimesh
 
     before = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -196,7 +197,7 @@ def _join(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def _spiral(count: int, rng: torch.Generator) -> Tensor:
-    """(count, 3) unit vectors, even over the sphere between the two largest elevations."""
+    """(count, 3) unit vectors, evenly distributed between the minimum and maximum elevation."""
     steps = torch.arange(count, dtype=torch.float64)
     up = math.sin(MAX_ELEVATION) * (1 - (2 * steps + 1) / count)
     golden_angle = math.pi * (3 - math.sqrt(5))
@@ -206,9 +207,9 @@ def _spiral(count: int, rng: torch.Generator) -> Tensor:
 
 
 def _slab(origins: Tensor, directions: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Where lines enter and leave a box: (R,) near and far; near > far where they miss."""
+    """(R,) distances at which lines enter and leave a box; near > far for lines that miss it."""
     lower, upper = corners.reshape(2, -1)
-    tiny = torch.finfo(directions.dtype).tiny  # a line along a face must not give 0 / 0
+    tiny = torch.finfo(directions.dtype).tiny  # avoids 0 / 0 for lines parallel to a face
     safe = torch.where(directions == 0, tiny, directions)
     first, second = (lower - origins) / safe, (upper - origins) / safe
     near = torch.minimum(first, second).amax(dim=1)
@@ -218,21 +219,21 @@ def _slab(origins: Tensor, directions: Tensor, corners: Tensor) -> tuple[Tensor,
 def _ball(
     origins: Tensor, directions: Tensor, center: tuple[float, ...], radius: float
 ) -> tuple[Tensor, Tensor]:
-    """Where lines enter and leave a ball, or in two coordinates an endless cylinder; as _slab."""
+    """As `_slab`, for a ball (3 coordinates) or an infinite vertical cylinder (2 coordinates)."""
     columns = len(center)
     offset = origins[:, :columns] - origins.new_tensor(center)
     heading = directions[:, :columns]
     a = heading.square().sum(dim=1).clamp(min=1e-30)
     half_b = (offset * heading).sum(dim=1)
     c = offset.square().sum(dim=1) - radius**2
-    root = (half_b.square() - a * c).sqrt()  # NaN where the line misses
+    root = (half_b.square() - a * c).sqrt()  # NaN for lines that miss
     misses = root.isnan()
     near, far = (-half_b - root) / a, (-half_b + root) / a
     return near.masked_fill(misses, torch.inf), far.masked_fill(misses, -torch.inf)
 
 
 def _shell_ranges(origins: Tensor, directions: Tensor) -> Tensor:
-    """(R,) distance to walls, floor and ceiling from inside; infinite through an opening."""
+    """(R,) distance to walls, floor and ceiling from inside; infinite for rays through an opening."""
     corners = origins.new_tensor((0.0, 0.0, 0.0, *ROOM))
     ranges = _slab(origins, directions, corners)[1]
     ends = origins + ranges[:, None] * directions
@@ -245,7 +246,7 @@ def _shell_ranges(origins: Tensor, directions: Tensor) -> Tensor:
 
 
 def _shell_mesh() -> trimesh.Trimesh:
-    """Walls without their openings, floor and ceiling, facing inward."""
+    """Floor, ceiling and walls without the openings, with normals pointing inward."""
     import trimesh
 
     quads = []
@@ -262,7 +263,7 @@ def _shell_mesh() -> trimesh.Trimesh:
                     quad = np.full((4, 3), ROOM[axis] if far else 0.0)
                     quad[:, u_axis] = [u[0], u[1], u[1], u[0]]
                     quad[:, v_axis] = [v[0], v[0], v[1], v[1]]
-                    # u x v is +axis for x and z, -axis for y; inward is +axis at 0, -axis at ROOM
+                    # u x v points to +axis for x and z, -axis for y; inward is +axis at 0, -axis at ROOM
                     quads.append(quad[::-1] if far != (axis == 1) else quad)
     faces = np.concatenate([4 * i + np.array([[0, 1, 2], [0, 2, 3]]) for i in range(len(quads))])
     return trimesh.Trimesh(np.concatenate(quads), faces, process=False)

@@ -1,4 +1,4 @@
-"""Scan after scan into a map, with checkpoints from which a killed run goes on."""
+"""Incremental mapping of a stream of scans, with checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from lardhm_torch.scans import Scans
 
 @dataclass(frozen=True, kw_only=True)
 class StreamConfig:
-    """How a stream of scans is learned."""
+    """Settings of incremental mapping."""
 
-    num_clusters: int | None = None  # of a scan in a place the map does not know; None: from data
-    max_clusters: int | None = None  # of such a scan, however much data it has; None: no limit
-    max_rays: int | None = None  # of a scan, at random; None: all
-    radius: float | None = None  # [m] around the sensor, beyond which the map forgets; None: never
-    checkpoint_every: int = 1  # scans between two checkpoints
-    seed: int = 0  # of everything random; scan n uses seed + n
+    num_clusters: int | None = None  # per scan of an unmapped place; None: chosen from the data
+    max_clusters: int | None = None  # upper bound on num_clusters; None: no limit
+    max_rays: int | None = None  # per scan, drawn at random; None: all
+    radius: float | None = None  # [m] clusters farther from the sensor are removed; None: keep all
+    checkpoint_every: int = 1  # write a checkpoint every N scans
+    seed: int = 0  # random seed; scan n uses seed + n
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     update: UpdateConfig = field(default_factory=UpdateConfig)
 
@@ -69,7 +69,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
 
 @dataclass(frozen=True)
 class Progress:
-    """How much of a stream is in a map: scans taken (or passed over), and rays in them."""
+    """Progress of a stream: number of processed scans (skipped ones included) and of their rays."""
 
     scans: int = 0
     rays: int = 0
@@ -85,27 +85,27 @@ def stream_scans(
     after_scan: Callable[[LardHilbertMap], None] | None = None,
     progress: bool = False,
 ) -> Progress:
-    """Update a map with one scan after the other.
+    """Update a map with each scan of a stream.
 
-    Every ``checkpoint_every`` scans, and at the end, the map and how many scans are in it are
-    written to ``path`` in one atomic step: a run killed at any moment goes on from there
-    (`resume_stream`) and ends with the very map of a run that was not killed.
+    Every ``checkpoint_every`` scans and at the end, the map and the progress are written to ``path``
+    atomically. An interrupted run can be resumed from there (`resume_stream`) and yields exactly the
+    map of an uninterrupted run.
 
     Args:
-        model: changed in place.
-        scans: one scan each (`iter_scans`); a scan without a usable ray is passed over, with a
+        model: map, changed in place.
+        scans: iterable of single scans (`iter_scans`); a scan without usable rays is skipped with a
             warning.
-        config: clusters, forgetting, checkpoints.
+        config: clusters, sampling, checkpoints; None: the defaults.
         path: map file; None: no checkpoints.
-        done: what `resume_stream` found; so many scans are passed over.
-        after_scan: called with the map after every scan it learned, for a live view say.
-        progress: show a bar with the rate on a terminal.
+        done: progress returned by `resume_stream`; these scans are skipped.
+        after_scan: callback that receives the map after every processed scan, e.g. a live view.
+        progress: show a progress bar on a terminal.
 
     Returns:
-        What is in the map now.
+        Progress after the last scan.
 
     Raises:
-        ValueError: the scans are not those that ``done`` was counted in.
+        ValueError: the scans do not match ``done``.
     """
     config, done = config or StreamConfig(), done or Progress()
     seen, saved = Progress(), done
@@ -137,19 +137,19 @@ def stream_scans(
 
 
 def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progress]:
-    """The map of a checkpoint and how much of the stream is in it.
+    """Load the map and the progress of a checkpoint.
 
-    Partial files that an interrupted run left beside the checkpoint are removed.
+    Partial files that an interrupted run left next to the checkpoint are removed.
 
     Args:
-        path: checkpoint that `stream_scans` wrote.
+        path: checkpoint written by `stream_scans`.
 
     Returns:
-        The map, and how many scans and rays are in it.
+        The map and the progress of its stream.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is not a map, or not one that a stream wrote.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not a map, or not a checkpoint of a stream.
     """
     found = map_files.load_state(path).get(map_files.STREAM_KEY)
     if not isinstance(found, dict) or not all(
@@ -174,11 +174,11 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         scan = scan.select(rows.sort().values)
     try:
         sampling = config.sampling
-        if len(model):  # `update` learns nothing from unknown points
+        if len(model):  # `update` ignores unknown points
             sampling = replace(sampling, behind_samples=0)
         samples = sample_rays(scan, sampling, seed=seed)
     except NoUsableRayError as error:
-        warnings.warn(f"scan {number} was passed over: no usable ray; {error}", stacklevel=3)
+        warnings.warn(f"scan {number} was skipped: no usable ray; {error}", stacklevel=3)
         return
     num_clusters = _num_clusters(samples, config)
     model.update(samples.points, samples.labels, num_clusters, seed=seed, config=config.update)
@@ -190,6 +190,6 @@ def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
     if config.max_clusters is None:
         return config.num_clusters
     *classes, unknown = split_labels(samples.points, samples.labels)
-    shares = 2 if len(unknown) else 1  # free space beside the unknown takes as many again
-    chosen = config.num_clusters or shares * sum(scan_clusters(classes))
+    factor = 2 if len(unknown) else 1  # with unknown points, the free class gets twice as many
+    chosen = config.num_clusters or factor * sum(scan_clusters(classes))
     return config.num_clusters if chosen <= config.max_clusters else config.max_clusters

@@ -12,7 +12,7 @@ from lardhm_torch.learning.clustering import (
     choose_num_clusters,
     cluster_classes,
     cluster_points,
-    clusters_about,
+    clusters_from_moments,
     merge_small,
     mini_batch_kmeans,
     pool_clusters,
@@ -53,7 +53,7 @@ def test_moments_equal_numpy_cluster_by_cluster(dim):
     points = torch.randn(300, dim, generator=rng(), dtype=F64) + 50
     centers = points[:7] + 0.1
     labels, *moments = native.assign(points, centers)
-    clusters = clusters_about(centers, *moments)
+    clusters = clusters_from_moments(centers, *moments)
     for m in range(7):
         members = points[labels == m].numpy()
         assert clusters.counts[m] == len(members)

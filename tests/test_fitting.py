@@ -12,9 +12,9 @@ from lardhm_torch.learning.fitting import (
     FitConfig,
     balance_classes,
     batch_gradient,
-    deal_samples,
     fit_weights,
     logistic_loss,
+    stratified_batches,
 )
 
 F64 = torch.float64
@@ -149,14 +149,18 @@ def test_features_are_computed_once_where_kept_and_else_anew_for_every_two_passe
 
 
 @pytest.mark.parametrize(("count", "batch_size"), [(1, 5), (97, 10), (600, 7), (600, 1000)])
-def test_every_sample_is_dealt_once_and_every_batch_reaches_over_all_of_them(count, batch_size):
+def test_stratified_batches_hold_every_sample_once_and_each_batch_covers_all_of_them(
+    count, batch_size
+):
     rows = torch.arange(count)
-    dealt, twice = deal_samples((rows, 2.0 * rows), batch_size, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(twice, 2.0 * dealt)
-    torch.testing.assert_close(dealt.sort().values, rows)
+    batched, twice = stratified_batches(
+        (rows, 2.0 * rows), batch_size, torch.Generator().manual_seed(0)
+    )
+    torch.testing.assert_close(twice, 2.0 * batched)
+    torch.testing.assert_close(batched.sort().values, rows)
     batches = -(-count // batch_size)
-    descents = (dealt.diff() < 0).nonzero().squeeze(1) + 1
-    parts = dealt.tensor_split(descents)  # a batch ascends
+    descents = (batched.diff() < 0).nonzero().squeeze(1) + 1
+    parts = batched.tensor_split(descents)  # a batch ascends
     assert len(parts) == batches
     for part in parts:
         edges = torch.cat([torch.tensor([-1]), part, torch.tensor([count])])
@@ -222,7 +226,7 @@ def test_native_training_features_equal_the_definition(dim):
 
 @given(count=st.integers(1, 100_000), asked=st.one_of(st.none(), st.integers(1, 5000)))
 def test_all_batches_of_a_pass_are_about_equally_large(count, asked):
-    size = FitConfig(batch_size=asked).rows_a_batch(count)
+    size = FitConfig(batch_size=asked).rows_per_batch(count)
     batches = -(-count // size)
     last = count - (batches - 1) * size
     assert size <= (asked or max(256, count // 128))
@@ -232,6 +236,6 @@ def test_all_batches_of_a_pass_are_about_equally_large(count, asked):
 def test_few_points_get_as_many_steps_as_many():
     assert FitConfig().passes_over(10**6) == 4
     for count in (1, 50, 300, 5000):
-        batches = -(-count // FitConfig().rows_a_batch(count))
+        batches = -(-count // FitConfig().rows_per_batch(count))
         assert FitConfig().passes_over(count) * batches >= 256
     assert FitConfig(passes=1).passes_over(50) == 1

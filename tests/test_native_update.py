@@ -8,9 +8,9 @@ from lardhm_torch import native
 from lardhm_torch.features import kernel_factors, raw_factors
 from lardhm_torch.learning.assignment import (
     explain,
+    inside_candidates,
+    kernels_near,
     ordered_features,
-    possibly_inside,
-    reaching,
     unexplained,
 )
 from lardhm_torch.learning.cluster_matching import pool_into
@@ -89,14 +89,14 @@ def test_all_points_inside_a_cluster_are_possibly_inside(dtype, dim, native_path
     clusters = cluster_points(in_morton_order(sources)[0], 20, rng)
     points = 8 * torch.rand(20_000, dim, generator=rng, dtype=dtype) - 4
     inside = explain(points, clusters, 0.01, 3.0, 3.0)[0] < len(clusters)
-    possible = possibly_inside(points, clusters, 0.01, 3.0)
+    possible = inside_candidates(points, clusters, 0.01, 3.0)
     assert torch.equal(points[inside], possible[torch.isin(possible[:, 0], points[inside, 0])])
     assert 50 < inside.sum() <= len(possible)
     if native_path:
         assert len(possible) < 8 * inside.sum()
     moments = (clusters.counts, clusters.means, clusters.scatters)
-    assert len(possibly_inside(points, Clusters(*(t[:0] for t in moments)), 0.01, 3.0)) == 0
-    assert len(possibly_inside(points[:0], clusters, 0.01, 3.0)) == 0
+    assert len(inside_candidates(points, Clusters(*(t[:0] for t in moments)), 0.01, 3.0)) == 0
+    assert len(inside_candidates(points[:0], clusters, 0.01, 3.0)) == 0
 
 
 def test_owners_of_other_points_are_refused(ops):
@@ -118,13 +118,13 @@ def test_a_cluster_reaches_a_box_where_its_kernel_does_along_every_axis(dim, nat
     centers, raw, _ = make_map(500, dim, torch.float64)
     raw[::3] -= 2 * torch.eye(dim)  # thin ones, some below the floor
     points = 1 + torch.rand(50, dim, generator=torch.Generator().manual_seed(0)).double()
-    found = reaching(centers, raw, kernel(5), points, 2.0)
+    found = kernels_near(centers, raw, kernel(5), points, 2.0)
     reach = 2 * torch.linalg.vector_norm(kernel_factors(raw, kernel(5)), dim=2)
     lower, upper = points.amin(dim=0), points.amax(dim=0)
     gap = torch.maximum(lower - centers, centers - upper)
     assert torch.equal(found, (gap <= reach).all(dim=1))
     assert 20 < found.sum() < 480
-    assert reaching(centers[:0], raw[:0], kernel(5), points, 2.0).shape == (0,)
+    assert kernels_near(centers[:0], raw[:0], kernel(5), points, 2.0).shape == (0,)
 
 
 @dims

@@ -140,7 +140,7 @@ def test_a_map_that_no_stream_wrote_cannot_be_resumed(tmp_path):
 def test_a_scan_without_a_usable_ray_is_passed_over_with_a_warning(folder, whole):
     empty = Scans(torch.zeros(1, 3), torch.zeros(5, 3))
     model = LardHilbertMap()
-    with pytest.warns(UserWarning, match="scan 0 was passed over: no usable ray"):
+    with pytest.warns(UserWarning, match="scan 0 was skipped: no usable ray"):
         seen = stream_scans(model, [empty, *iter_scans(folder)])
     assert seen.scans == 10
     assert len(model) > 0

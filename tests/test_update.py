@@ -19,7 +19,7 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.cluster_matching import match_clusters, merge_clusters
 from lardhm_torch.learning.clustering import cluster_points
 from lardhm_torch.learning.map_state import MapState, factor_covariances
-from lardhm_torch.learning.replay import contradicted, forget, hit_clusters
+from lardhm_torch.learning.replay import contradicted, decay_evidence, hit_clusters
 
 F64 = torch.float64
 PAPER = UpdateConfig(as_in_paper=True, replay=0)
@@ -382,9 +382,9 @@ def test_a_contradicted_cluster_forgets_most_of_its_past_and_keeps_its_shape():
     points = wall()[0]
     clusters = cluster_points(points[:600], 4, torch.Generator().manual_seed(0))
     part = state_of(clusters, torch.ones(len(clusters), dtype=torch.bool))
-    worth = torch.full_like(part.weights, torch.inf)
-    worth[0] = 0.5
-    after = forget(part, worth, memory=80.0)
+    bound = torch.full_like(part.weights, torch.inf)
+    bound[0] = 0.5
+    after = decay_evidence(part, bound, memory=80.0)
     assert torch.equal(after.counts[1:], part.counts[1:])
     assert after.counts[0] == 20
     torch.testing.assert_close(after.clusters.covariances, part.clusters.covariances)

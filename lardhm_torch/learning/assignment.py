@@ -1,4 +1,4 @@
-"""What an update asks of many clusters or points at once: the definition, and its native twin."""
+"""Assignment of points to existing clusters, in plain torch and in the native library."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from torch import Tensor
 
 from lardhm_torch import features, native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.clustering import Clusters, clusters_about, points_where
+from lardhm_torch.learning.clustering import Clusters, clusters_from_moments, points_where
 from lardhm_torch.learning.map_state import factor_covariances
 
 
-def reaching(
+def kernels_near(
     centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, points: Tensor, stds: float
 ) -> Tensor:
-    """Which kernels reach into the box around points: along every axis, some standard deviations far.
+    """Mask of the kernels whose bounding boxes intersect the bounding box of the points.
 
     Args:
         centers: (M, D) cluster centers [m].
-        raw_scale_tril: (M, D, D) factors with the logarithm of their diagonals.
-        kernel: covariance scale and floor.
+        raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
+        kernel: covariance scale and minimum length-scale.
         points: (N, D) positions [m], at least one, finite.
-        stds: how far a kernel is taken to reach, in its own standard deviations.
+        stds: half-width of the bounding box of a kernel, in its standard deviations.
 
     Returns:
         (M,) bool.
@@ -31,27 +31,28 @@ def reaching(
         return torch.ops.lardhm.reaching(*given, stds, *kernel[1:])
     lower, upper = points.aminmax(dim=0)
     factors = features.kernel_factors(raw_scale_tril, kernel)
-    reach = stds * torch.linalg.vector_norm(factors, dim=2)
-    return ((centers + reach >= lower) & (centers - reach <= upper)).all(dim=1)
+    half_width = stds * torch.linalg.vector_norm(factors, dim=2)
+    return ((centers + half_width >= lower) & (centers - half_width <= upper)).all(dim=1)
 
 
 def explain(
     points: Tensor, clusters: Clusters, floor: float, radius: float, reach: float
 ) -> tuple[Tensor, Clusters]:
-    """Every point to the cluster with the nearest mean, if it is near enough.
+    """Assign every point to the cluster with the nearest mean, if it is within the given radii.
 
-    Distances to decide whether it is near enough are in standard deviations of the cluster.
+    The radii are Mahalanobis distances, in standard deviations of the cluster.
 
     Args:
         points: (N, D) positions [m].
-        clusters: M of them, at least one.
+        clusters: M clusters, at least one.
         floor: smallest standard deviation [m], see `map_state.factor_covariances`.
-        radius: nearer points join the cluster.
-        reach: nearer points have an owner; not less than ``radius``.
+        radius: points within it join the cluster.
+        reach: points within it are owned by the cluster; at least ``radius``.
 
     Returns:
-        (N,) int owners, M for a point without one; the moments of the points that join each of the
-        clusters, of none the cluster's own mean and no scatter. Sums are taken in float64.
+        (N,) int owner of each point, M for points without an owner; and the moments of the points
+        that join each cluster, accumulated in float64. A cluster that no point joins has count 0,
+        its own mean and scatter 0.
     """
     if native.supports(points):
         rule = (floor, radius, reach)
@@ -73,20 +74,20 @@ def explain(
         moments[0].index_add_(0, owner, torch.ones_like(offset[:, 0]))
         moments[1].index_add_(0, owner, offset)
         moments[2].index_add_(0, owner, offset[:, :, None] * offset[:, None])
-    found = clusters_about(centers.double(), *moments)
+    found = clusters_from_moments(centers.double(), *moments)
     return owners, Clusters(found.counts, found.means.to(centers), found.scatters.to(centers))
 
 
-def possibly_inside(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
-    """(P, D) the points that can lie inside some cluster: all that do, in their order, and others.
+def inside_candidates(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
+    """(P, D) candidate points that may lie inside some cluster, in order.
 
-    Asking only them where the points lie saves most of the time.
+    This fast prefilter keeps all points that lie inside a cluster, and possibly others.
 
     Args:
         points: (N, D) positions [m].
-        clusters: M of them.
+        clusters: M clusters.
         floor: smallest standard deviation [m], see `map_state.factor_covariances`.
-        radius: standard deviations within which a point is inside.
+        radius: points within this Mahalanobis distance are inside.
     """
     if native.supports(points):
         return torch.ops.lardhm.possibly_inside(points.detach(), *clusters, floor, radius)
@@ -94,12 +95,12 @@ def possibly_inside(points: Tensor, clusters: Clusters, floor: float, radius: fl
 
 
 def unexplained(points: Tensor, owners: Tensor, kept: Tensor) -> Tensor:
-    """(R, D) the points that no kept cluster owns, in their order.
+    """(R, D) points that are not owned by a kept cluster, in order.
 
     Args:
         points: (N, D) positions [m].
-        owners: (N,) of `explain`.
-        kept: (M,) bool, which clusters keep the points that they own.
+        owners: (N,) owners returned by `explain`.
+        kept: (M,) bool, clusters that keep their points.
     """
     if native.supports(points):
         return torch.ops.lardhm.unexplained(points.detach(), owners, kept)
@@ -115,18 +116,18 @@ def ordered_features(
     kernel: Kernel,
     index: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """`native.nearest_features` of ``points[order]``, searched in the order of the points.
+    """`native.nearest_features` of ``points[order]``, computed in the order of ``points``.
 
-    Neighbors that follow each other are found faster than those far apart, as in batches. The columns
-    of a row come in any order, the same for indices and values.
+    The search is faster if consecutive points are close to each other, which is not the case in
+    batches. The order of the columns in a row is unspecified, but equal in indices and values.
 
     Args:
         points: (N, D) positions [m].
-        order: (N,) every row once.
+        order: (N,) permutation of the rows.
         centers: (M, D) cluster centers [m].
-        raw_scale_tril: (M, D, D) factors with the logarithm of their diagonals.
-        kernel: k, covariance scale and floor.
-        index: of the centers, see `native.build_index`.
+        raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
+        kernel: k, covariance scale and minimum length-scale.
+        index: search index of the centers, see `native.build_index`.
     """
     if native.supports(points):
         given = (points, order, centers, raw_scale_tril, index)

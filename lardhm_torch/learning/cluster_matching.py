@@ -1,4 +1,4 @@
-"""Clusters of one map and others that may be the same: matched, pooled, appended (Algorithm 2)."""
+"""Matching, merging and appending of clusters (Algorithm 2)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from lardhm_torch.learning.map_state import MapState, factor_covariances, new_ro
 def match_clusters(
     known: MapState, new: Clusters, is_occupied: Tensor, zeta: float, floor: float
 ) -> Tensor:
-    """(P,) the row of the known cluster that each new one merges with, or -1.
+    """(P,) row of the known cluster that matches each new cluster, or -1.
 
-    They match if they are of one class, closer than zeta, and each center lies within one standard
-    deviation of the other's cluster; of several matches the nearest is taken.
+    Two clusters match if they have the same class, their centers are closer than ``zeta``, and each
+    center lies within one standard deviation of the other cluster. Of several matches the nearest is
+    used.
 
     Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 6.
     """
@@ -33,14 +34,14 @@ def match_clusters(
     distance = squared_distances(new.means[rows], known.means[columns])
     nearest = distance.new_full((len(new),), torch.inf).scatter_reduce(0, rows, distance, "amin")
     first = distance == nearest[rows]
-    none = len(known)  # of equally near ones the lower row
+    none = len(known)  # ties are resolved in favor of the lower row
     match = torch.full((len(new),), none, device=rows.device)
     match = match.scatter_reduce(0, rows[first], columns[first], "amin")
     return torch.where(match == none, -1, match)
 
 
 def _pairs_within(first: Tensor, second: Tensor, distance: float) -> Tensor:
-    """(2, L) all pairs of rows of (P, D) and (Q, D) positions that are closer than ``distance``."""
+    """(2, L) all pairs of rows of (P, D) and (Q, D) positions closer than ``distance`` [m]."""
     found = []
     step = max(1, (1 << 22) // max(1, len(second)))
     for start in range(0, len(first), step):
@@ -59,7 +60,7 @@ def whitened(offsets: Tensor, covariances: Tensor, floor: float) -> Tensor:
 def merge_clusters(
     known: MapState, new: Clusters, is_occupied: Tensor, zeta: float, floor: float
 ) -> MapState:
-    """Known clusters pooled with the new ones that match them; the others appended, weight 0.
+    """Merge known clusters with matching new ones; append the others with weight 0.
 
     Source: Guizilini & Ramos 2016, Algorithm 2, lines 7 to 16.
     """
@@ -72,15 +73,15 @@ def merge_clusters(
 
 
 def take_clusters(clusters: Clusters, rows: Tensor) -> Clusters:
-    """The clusters of a mask or of indices, in that order."""
+    """The clusters selected by a mask or by indices, in that order."""
     rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
     return Clusters(*(moments.index_select(0, rows) for moments in clusters))
 
 
 def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> MapState:
-    """The clusters in rows ``where`` pooled with one more each.
+    """Merge the clusters in rows ``where`` with one cluster each.
 
-    Centers and factors move by the change of the moments, so that what tuning learned stays.
+    Centers and factors are changed by the change of the moments, so fine-tuning is preserved.
     """
     before = known.rows(where)
     if native.supports(before.means):
@@ -101,7 +102,7 @@ def pool_into(known: MapState, where: Tensor, found: Clusters, floor: float) -> 
 
 
 def _pooled(known: MapState, found: Clusters, floor: float) -> tuple[Clusters, Tensor, Tensor]:
-    """Pooled clusters, how far their means moved, and the moved factors: the definition."""
+    """Merged clusters, shift of their means, and updated raw factors, in plain torch."""
     groups = torch.arange(len(known), device=known.counts.device).repeat(2)
     both = concatenate_clusters([known.clusters, found])
     pooled = pool_clusters(both, groups, num_groups=len(known))
@@ -110,9 +111,9 @@ def _pooled(known: MapState, found: Clusters, floor: float) -> tuple[Clusters, T
 
 
 def moved_factors(raw_scale_tril: Tensor, before: Tensor, after: Tensor) -> Tensor:
-    """Raw factors moved as the factors of the moments moved: L -> after inv(before) L.
+    """Apply the change of the moments' factors to raw factors: L -> after inv(before) L.
 
-    A factor that nobody tuned equals ``before`` and becomes ``after``.
+    A factor that was not fine-tuned equals ``before`` and becomes ``after``.
     """
     diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
     factors = raw_scale_tril.tril(-1) + torch.diag_embed(diagonal)
@@ -122,9 +123,9 @@ def moved_factors(raw_scale_tril: Tensor, before: Tensor, after: Tensor) -> Tens
 def append_clusters(
     known: MapState, new: Clusters, is_occupied: Tensor, floor: float, where: Tensor | None = None
 ) -> MapState:
-    """New clusters, weight 0, after the known ones; the first replace the rows ``where``.
+    """Append new clusters with weight 0; the first ones replace the rows ``where``.
 
-    A replaced row passes its weight on.
+    Clusters that replace a row keep the weight of that row.
     """
     where = known.counts[:0] if where is None else where
     rows = new_rows(new, is_occupied, floor)

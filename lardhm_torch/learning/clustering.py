@@ -1,7 +1,7 @@
-"""Points to clusters: where the features sit and how wide they are.
+"""Clustering of points: centers and covariances of the features.
 
-Mini-batch k-means (Algorithm 1) finds the centers; the mean and scatter of the points nearest to
-each center are its moments (eq. 6, 7), which pool exactly when clusters merge.
+Mini-batch k-means (Algorithm 1) finds the centers. The moments of a cluster are the mean and scatter
+of the points nearest to its center (eq. 6, 7). The moments of merged clusters are exact.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from lardhm_torch import native
 from lardhm_torch.native import nearest_centers
 from lardhm_torch.points import morton_order
 
-POINTS_PER_CLUSTER = 15  # of the rule that chooses the number of clusters, where points are sparse
-DENSE_POINTS = 35  # the same where they are dense, or clusters would fit the noise of the hits
-CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] of the cells that tell the two apart, and how
-CELLS_PER_SCAN_CLUSTER = 1  # the same where more scans will follow: a single one shows less
-MAX_CHOSEN = 5000  # a class
-START_POINTS = 50  # a center, drawn at random, among which the start is chosen
-ITERATIONS = 20  # of k-means: t of Algorithm 1
-VOLUME_ITERATIONS = 5  # the same where clusters fill a volume beside an unknown one: they are many
-FEW_POINTS = 64  # of a class whose points may each be a cluster: hits of a few beams
+POINTS_PER_CLUSTER = 15  # minimum mean number of points per cluster in `choose_num_clusters`
+DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the noise
+CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] grid cells, and occupied cells per cluster
+CELLS_PER_SCAN_CLUSTER = 1  # the same in updates: finer, because more scans will follow
+MAX_CHOSEN = 5000  # upper bound per class in `choose_num_clusters`
+START_POINTS = 50  # number of random points per center from which initial centers are chosen
+ITERATIONS = 20  # of k-means; t in Algorithm 1
+VOLUME_ITERATIONS = 5  # the same for free and unknown points, if there are unknown points
+FEW_POINTS = 64  # classes up to this size may have one cluster per point
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
 
 class Columns:
-    """A dataclass of tensors with as many rows each: iterates over them, in order."""
+    """Base class of dataclasses of tensors with equally many rows. Iteration yields the tensors."""
 
     def __iter__(self: Any) -> Iterator[Tensor]:
-        """The tensors."""
+        """Iterate over the tensors, in the order of the fields."""
         return (getattr(self, field.name) for field in fields(self))
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters(Columns):
-    """Moments of M clusters: enough to pool them, nothing that training changes.
+    """Moments of M clusters. They suffice to merge clusters, and training does not change them.
 
     Args:
         counts: (M,) int64 number of points.
@@ -65,13 +65,15 @@ class Clusters(Columns):
 def cluster_points(
     points: Tensor, num_clusters: int, rng: torch.Generator, iterations: int = ITERATIONS
 ) -> Clusters:
-    """At most ``num_clusters`` clusters of the points, none of fewer than five unless points are few.
+    """Cluster the points of one class into at most ``num_clusters`` clusters.
+
+    Clusters of fewer than `MIN_COUNT` points are merged, unless there are only few points.
 
     Args:
         points: (N, D) positions of one class [m], in the order of `morton_order`.
-        num_clusters: how many to look for; at most `most_clusters` of N.
-        rng: random state of the start and of the batches.
-        iterations: of k-means.
+        num_clusters: number of clusters to find; reduced to `most_clusters` of N.
+        rng: random generator of the initial centers and of the batches.
+        iterations: number of k-means iterations.
 
     Source: Guizilini & Ramos 2016, Algorithm 1, eq. (6), (7) and Section IV-B.
     """
@@ -79,49 +81,50 @@ def cluster_points(
     centers = mini_batch_kmeans(points, num_clusters, rng, iterations=iterations)
     _, counts, sums, scatters = native.assign(points, centers)
     min_count = min(MIN_COUNT, max(1, len(points) // num_clusters))
-    clusters = merge_small(clusters_about(centers, counts, sums, scatters), min_count)
-    # Neighbors in space are neighbors in memory: queries of large maps are faster.
+    clusters = merge_small(clusters_from_moments(centers, counts, sums, scatters), min_count)
+    # Clusters that are close in space are close in memory, so queries of large maps are faster.
     order = morton_order(clusters.means)
     return Clusters(*(moments[order] for moments in clusters))
 
 
 def most_clusters(num_points: int) -> int:
-    """How many clusters so many points of a class can have: five points each, a few points one."""
-    return max(num_points // MIN_COUNT, _few(num_points))
+    """Maximum number of clusters of a class: one per `MIN_COUNT` points, or per point if few."""
+    return max(num_points // MIN_COUNT, _max_singletons(num_points))
 
 
-def _few(num_points: int) -> int:
-    """How many clusters of fewer than five points there may be: none from 2 `FEW_POINTS` on."""
+def _max_singletons(num_points: int) -> int:
+    """Number of clusters that may be smaller than `MIN_COUNT`; 0 from 2 `FEW_POINTS` points on."""
     return max(0, min(num_points, 2 * FEW_POINTS - num_points))
 
 
 def cluster_classes(
     points: Tensor, labels: Tensor, num_clusters: int | None, rng: torch.Generator
 ) -> tuple[Clusters, Tensor]:
-    """Occupied and free points clustered apart, as the paper found to work better (Section II-B).
+    """Cluster occupied and free points separately, which works better (paper, Section II-B).
 
     Args:
         points: (N, D) positions [m], in the order of `morton_order`.
-        labels: (N,) 1 occupied, 0 free.
-        num_clusters: total over both classes; None: chosen from the data.
-        rng: random state.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+        num_clusters: total over all classes; None: chosen from the data.
+        rng: random generator.
 
     Returns:
-        (M clusters, the occupied ones first; (M,) bool, which are occupied).
+        M clusters, occupied ones first, and an (M,) bool mask of the occupied ones.
     """
     classes = split_labels(points, labels)
     if num_clusters is None:
         chosen = choose_num_clusters(next(members for members in classes if len(members)))
-        totals = [chosen * share for share in class_shares(len(classes[2]))]
+        totals = [chosen * ratio for ratio in class_ratios(len(classes[2]))]
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
     return cluster_each(classes, totals, rng)
 
 
-def class_shares(num_unknown: int) -> tuple[int, int, int]:
-    """Clusters of the occupied, the free and the unknown points, in proportion.
+def class_ratios(num_unknown: int) -> tuple[int, int, int]:
+    """Relative numbers of clusters of occupied, free and unknown points.
 
-    Free space that must end where the unknown begins takes twice as many clusters.
+    With unknown points, free space gets twice as many clusters, because it must end where unknown
+    space begins.
     """
     return (1, 2, 1) if num_unknown else (1, 1, 0)
 
@@ -129,13 +132,13 @@ def class_shares(num_unknown: int) -> tuple[int, int, int]:
 def cluster_each(
     classes: list[Tensor], totals: Sequence[int], rng: torch.Generator
 ) -> tuple[Clusters, Tensor]:
-    """(M clusters, (M,) bool which are occupied) of the points of each class, in order.
+    """Cluster each class; returns M clusters in that order and an (M,) bool mask of occupied ones.
 
     Args:
         classes: (N, D) occupied, (F, D) free and, if given, (U, D) unknown positions [m], in the
             order of `morton_order`.
-        totals: how many clusters of each to look for.
-        rng: random state.
+        totals: number of clusters to find in each class.
+        rng: random generator.
     """
     with_unknown = len(classes) > 2 and len(classes[2]) > 0
     rest = VOLUME_ITERATIONS if with_unknown else ITERATIONS
@@ -143,7 +146,7 @@ def cluster_each(
     for number, (members, total) in enumerate(zip(classes, totals, strict=True)):
         if len(members) and total:
             found = cluster_points(members, total, rng, rest if number else ITERATIONS)
-            parts.append(of_unknown(found) if number == 2 else found)
+            parts.append(unknown_clusters(found) if number == 2 else found)
     clusters = concatenate_clusters(parts)
     is_occupied = torch.zeros_like(clusters.counts, dtype=torch.bool)
     is_occupied[: len(parts[0]) if len(classes[0]) else 0] = True
@@ -151,7 +154,7 @@ def cluster_each(
 
 
 def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
-    """Occupied and free points; views where the occupied ones come first, as from `sample_rays`."""
+    """Occupied and free points. Views if occupied points come first, as from `sample_rays`."""
     count = int(is_occupied.sum())
     if bool(is_occupied[:count].all()):
         return [points[:count], points[count:]]
@@ -159,78 +162,81 @@ def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
 
 
 def split_labels(points: Tensor, labels: Tensor) -> list[Tensor]:
-    """Occupied, free and unknown points, by labels of 1, 0 and 1/2."""
+    """Occupied, free and unknown points (labels 1, 0 and 1/2)."""
     occupied, rest = split_classes(points, labels > 0.5)
     if bool((labels != 0.5).all()):
         return [occupied, rest, rest[:0]]
     return [occupied, points_where(points, labels < 0.5), points_where(points, labels == 0.5)]
 
 
-def of_unknown(clusters: Clusters) -> Clusters:
-    """Clusters of unknown points: as wide, but they count nothing, and all that is seen replaces them."""
+def unknown_clusters(clusters: Clusters) -> Clusters:
+    """The same clusters with count 0 and their covariances as scatters, for unknown points.
+
+    They do not contribute to the counts and means of clusters that they are pooled with.
+    """
     return Clusters(torch.zeros_like(clusters.counts), clusters.means, clusters.covariances)
 
 
 def points_where(points: Tensor, mask: Tensor) -> Tensor:
-    """``points[mask]``, twice as fast."""
+    """``points[mask]``, but about twice as fast."""
     return points.index_select(0, mask.nonzero().squeeze(1))
 
 
 def concatenate_clusters(parts: list[Clusters]) -> Clusters:
-    """All clusters of several, in order."""
+    """Concatenate clusters, in order."""
     return Clusters(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
-    """How many clusters each class gets: occupied, free and, where there are any, unknown points.
+    """Number of clusters of the occupied, the free and, if given, the unknown class.
 
-    By `class_shares`, what does not go round to the occupied class; a class that cannot fill its
-    share (five points a cluster) leaves the rest to the others.
+    The total is divided in the ratio of `class_ratios`, rounded in favor of the occupied class. If a
+    class has too few points (see `most_clusters`), the remainder goes to the other classes.
     """
-    room = [most_clusters(size) for size in class_sizes]
-    num_unknown = room[2] if len(room) > 2 else 0
-    shares = class_shares(num_unknown)
-    unknown = min(num_unknown, num_clusters * shares[2] // sum(shares))
+    most = [most_clusters(size) for size in class_sizes]
+    num_unknown = most[2] if len(most) > 2 else 0
+    ratios = class_ratios(num_unknown)
+    unknown = min(num_unknown, num_clusters * ratios[2] // sum(ratios))
     known = num_clusters - unknown
-    fair = -(-known * shares[0] // (shares[0] + shares[1]))
-    occupied = min(room[0], max(fair, known - room[1]))
-    return [occupied, min(room[1], known - occupied), unknown][: len(room)]
+    target = -(-known * ratios[0] // (ratios[0] + ratios[1]))
+    occupied = min(most[0], max(target, known - most[1]))
+    return [occupied, min(most[1], known - occupied), unknown][: len(most)]
 
 
 def scan_clusters(classes: list[Tensor]) -> list[int]:
-    """How many clusters of each class a scan makes in a place that the map does not know.
+    """Number of clusters of each class for a scan of an unmapped place.
 
-    As many as `choose_num_clusters` gives, but finer: other scans will fill the place up. Only where
-    points are so dense that they share a cell with dozens of others are clusters coarser than
-    `POINTS_PER_CLUSTER` asks for.
+    This is the number given by `choose_num_clusters` with ``fine=True``, because later scans will
+    add points. Clusters have more than `POINTS_PER_CLUSTER` points only where points are so dense
+    that dozens of them lie in one cell.
 
     Args:
         classes: (N, D) occupied and (F, D) free positions [m].
     """
     chosen = choose_num_clusters(classes[0] if len(classes[0]) else classes[1], fine=True)
-    rooms = [most_clusters(len(members)) for members in classes]
-    return [min(chosen, room) for room in rooms]
+    limits = [most_clusters(len(members)) for members in classes]
+    return [min(chosen, limit) for limit in limits]
 
 
 def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
-    """How many clusters `fit` makes of a class with these occupied points; of the free one as many.
+    """Number of clusters per class that `fit` uses for these occupied points.
 
-    One for every `CELLS_PER_CLUSTER` cells with points in them, so that clusters are as fine as the
-    scene is large; of at least `POINTS_PER_CLUSTER` points on average, or they would be starved and
-    accuracy fall (paper, Section IV-B), and of at most `DENSE_POINTS`. Up to
-    `FEW_POINTS` points in different cells may have a cluster each: a cluster of beams that end far
-    apart would reach across the room. The number of free points says what the sampler was asked
-    for, and nothing about the scene.
+    The number is one per `CELLS_PER_CLUSTER` cells that contain points, so it is proportional to the
+    observed surface. It is bounded so that clusters have at least `POINTS_PER_CLUSTER` points on
+    average, because accuracy drops with fewer (paper, Section IV-B), and at most `DENSE_POINTS`. Up
+    to `FEW_POINTS` points in different cells may have a cluster each, because a cluster of hits that
+    are far apart would extend across the room. The free class gets as many clusters: the number of
+    free points depends on the sampler, not on the scene.
 
     Args:
         points: (N, D) positions [m].
-        fine: one for every `CELLS_PER_SCAN_CLUSTER` cells instead.
+        fine: use one cluster per `CELLS_PER_SCAN_CLUSTER` cells instead.
     """
     cells = (points / CELL_EDGE).floor().long()
     strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
-    # neighbors mostly follow each other: what is left to sort is a fraction of the points
+    # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
     count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
-    few = min(count, _few(len(points)))
+    few = min(count, _max_singletons(len(points)))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
     finest = max(len(points) // POINTS_PER_CLUSTER, few)
     coarsest = len(points) // DENSE_POINTS
@@ -257,22 +263,22 @@ def mini_batch_kmeans(
     batch_size: int | None = None,
     restart_every: int = 5,
 ) -> Tensor:
-    """Centers that are near to all points on average.
+    """Mini-batch k-means: centers with a small mean squared distance to the points.
 
-    Every batch point pulls its nearest center by 1 / (number of points that pulled it so far); a
-    whole batch at a time this is the running mean of all points a center has met. We depart from
-    Algorithm 1 twice, because each lowers the inertia by several percent: the random points of the
-    start and of the batches are spread along a space-filling curve, and the counters start anew
-    every ``restart_every`` iterations, so that a center forgets the points it met on its way.
+    Each center is the running mean of the batch points assigned to it: a point moves its nearest
+    center by the offset divided by the number of points assigned so far. There are two departures
+    from Algorithm 1, each of which lowers the inertia by several percent: initial centers and batches
+    are stratified samples in Morton order, and the counts are reset every ``restart_every``
+    iterations, so that points assigned to an earlier position of a center are discarded.
 
     Args:
-        points: (N, D) positions [m], in the order of `morton_order`; in another order the result is
-            as valid, but worse.
-        num_clusters: how many, at most N.
-        rng: random state of the start and of the batches.
-        iterations: t of Algorithm 1.
-        batch_size: b of Algorithm 1; None: 10 points a center.
-        restart_every: iterations between fresh counters.
+        points: (N, D) positions [m], in the order of `morton_order`; in any other order the
+            result is valid, but less accurate.
+        num_clusters: number of centers, at most N.
+        rng: random generator of the initial centers and of the batches.
+        iterations: t in Algorithm 1.
+        batch_size: b in Algorithm 1; None: 10 points per center.
+        restart_every: number of iterations between resets of the counts.
 
     Returns:
         (num_clusters, D) centers [m].
@@ -284,24 +290,24 @@ def mini_batch_kmeans(
     rows = spread_rows(len(points), batch_size, rng, iterations)
     if native.supports(points):
         return torch.ops.lardhm.kmeans(points, centers, rows, batch_size, restart_every)
-    met = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
+    counts = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
     for iteration in range(iterations):
         if iteration % restart_every == 0:
-            met.zero_()
+            counts.zero_()
         batch = points[rows[iteration]]
         labels = nearest_centers(batch, centers, 1).squeeze(1)
-        pulls = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
-        met += torch.bincount(labels, minlength=num_clusters)
-        centers = centers + pulls / met.clamp(min=1)[:, None]
+        shifts = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
+        counts += torch.bincount(labels, minlength=num_clusters)
+        centers = centers + shifts / counts.clamp(min=1)[:, None]
     return centers
 
 
 def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -> Tensor:
-    """Random points, one from each of m stretches of the order that are equally long in meters.
+    """Initial centers: stratified random points, with strata of equal length along the Morton order.
 
-    A stretch is weighted by the distance between points a quarter of a cluster apart in the order:
-    where points are sparse they are picked more often than their number says. Inertia is least
-    at a density of centers between that of the points and uniform, and starts near it.
+    The length of a step is the distance [m] between points that are a quarter of a cluster size
+    apart in the order, so sparse regions receive more centers than in proportion to their points.
+    The inertia is smallest for a density of centers between that of the points and a uniform one.
     """
     count = START_POINTS * num_clusters
     ordered = points[spread_rows(len(points), count, rng)] if len(points) > count else points
@@ -313,27 +319,29 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     behind = torch.cat([gaps[:1].expand(lag), gaps])
     weight = torch.minimum(ahead, behind).double()
     along = (weight + 1e-6 * weight.mean() + 1e-300).cumsum(0)
-    share = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
-    place = (torch.arange(num_clusters, device=rng.device) + share) / num_clusters * along[-1]
+    position = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
+    place = (torch.arange(num_clusters, device=rng.device) + position) / num_clusters * along[-1]
     return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
 
 
 def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) -> Tensor:
-    """(*times, count) random rows of N, ascending, one from each of ``count`` <= N equal stretches."""
+    """(*times, count) ascending random rows of N: one from each of ``count`` <= N equal strata."""
     shape = (*times, count)
     place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
     place += torch.arange(count, device=rng.device)
     return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
 
-def clusters_about(centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor) -> Clusters:
-    """Clusters of the points that `native.assign` gave to each center.
+def clusters_from_moments(
+    centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor
+) -> Clusters:
+    """Clusters from the moments about the centers that `native.assign` returns.
 
     Args:
-        centers: (M, D) what the moments are taken about [m].
+        centers: (M, D) reference positions of the moments [m].
         counts: (M,) number of points.
-        sums: (M, D) sum of the offsets from the center [m].
-        scatters: (M, D, D) sum of their outer products [m^2].
+        sums: (M, D) sums of the offsets from the center [m].
+        scatters: (M, D, D) sums of their outer products [m^2].
 
     Source: Guizilini & Ramos 2016, eq. (6), (7).
     """
@@ -343,25 +351,25 @@ def clusters_about(centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tens
 
 
 def pool_clusters(clusters: Clusters, groups: Tensor, num_groups: int) -> Clusters:
-    """Clusters of one group become one, with the exact moments of all their points.
+    """Merge the clusters of each group into one, with the exact moments of all their points.
 
-    The scatter about the common mean is the sum of the scatters plus n d d^T for every cluster's
-    distance d from that mean.
+    The scatter about the common mean is the sum of the scatters plus n d d^T for every cluster of n
+    points, where d is the offset of its mean from the common mean.
 
     Args:
         clusters: M clusters.
-        groups: (M,) group of each, 0 to num_groups - 1.
-        num_groups: how many groups.
+        groups: (M,) group of each cluster, 0 to num_groups - 1.
+        num_groups: number of groups.
     """
-    shares = clusters.counts.to(clusters.means.dtype)
+    sizes = clusters.counts.to(clusters.means.dtype)
     counts = clusters.counts.new_zeros(num_groups).index_add_(0, groups, clusters.counts)
     shape = (num_groups, clusters.means.shape[1])
     anchor = clusters.means.new_zeros(shape).index_copy_(0, groups, clusters.means)
-    offsets = (clusters.means - anchor[groups]) * shares[:, None]
+    offsets = (clusters.means - anchor[groups]) * sizes[:, None]
     shift = clusters.means.new_zeros(shape).index_add_(0, groups, offsets)
     means = anchor + shift / counts.clamp(min=1)[:, None]
     apart = clusters.means - means[groups]
-    between = shares[:, None, None] * apart[:, :, None] * apart[:, None, :]
+    between = sizes[:, None, None] * apart[:, :, None] * apart[:, None, :]
     scatters = between.new_zeros(*shape, shape[1]).index_add_(
         0, groups, clusters.scatters + between
     )
@@ -369,9 +377,9 @@ def pool_clusters(clusters: Clusters, groups: Tensor, num_groups: int) -> Cluste
 
 
 def merge_small(clusters: Clusters, min_count: int = MIN_COUNT) -> Clusters:
-    """Clusters of fewer than ``min_count`` points are pooled with their nearest large neighbor.
+    """Merge clusters of fewer than ``min_count`` points into their nearest large neighbor.
 
-    Empty clusters go. Where every cluster is small, the largest takes all.
+    Empty clusters are removed. If all clusters are small, they are merged into the largest.
 
     Source: Guizilini & Ramos 2016, Section IV-B.
     """

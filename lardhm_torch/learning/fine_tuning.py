@@ -1,4 +1,4 @@
-"""Length-scales, centers and weights learned together, by backpropagation."""
+"""Joint optimization of length-scales, centers and weights by backpropagation."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lardhm_torch.learning.parameters import MapParameters
 from lardhm_torch.points import check_samples, to_map_frame
 from lardhm_torch.sampling import Samples, seeded_generator
 
-WARM_UP_STEPS = 20  # over which the rates rise to their full value
-MAX_BATCH = 1 << 15  # points a step where none is asked for: memory does not grow with N
-State = dict[str, Any]  # tensors and plain values: `torch.save` it, `torch.load` it, give it back
-JUDGED_POINTS = 1 << 16  # whose loss is told after each epoch
+WARM_UP_STEPS = 20  # number of steps of the learning rate warm-up
+MAX_BATCH = 1 << 15  # upper bound on the default batch size, to limit memory
+State = dict[str, Any]  # tensors and plain values, for `torch.save` and `torch.load`
+EVALUATION_POINTS = 1 << 16  # number of points used to evaluate the loss after each epoch
 
 
 def fine_tune(
@@ -35,38 +35,40 @@ def fine_tune(
     after_epoch: Callable[[State], None] | None = None,
     progress: bool = False,
 ) -> list[float]:
-    """Move centers, length-scales and weights of a fitted map downhill on the balanced log-loss.
+    """Optimize centers, length-scales and weights of a fitted map on the balanced log-loss.
 
-    Adam with a short warm-up and rates falling to 0. Centers move in units of their cluster's mean
-    length-scale and factors by the logarithm of their diagonal, so the rates need no scene and
-    every factor stays valid. The neighbors of every point are found anew in every step, and points
-    are streamed, so memory does not grow with their number. With ``hold_out`` a share of the rays
-    does not train, and the epoch that predicts it best is kept; the given map is no candidate,
-    because `fit` has seen those rays. If anything fails the map is as it was.
+    The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
+    of centers are in units of the mean length-scale of their cluster, and the diagonals of factors
+    are optimized as logarithms. Learning rates are therefore independent of the scene, and every
+    factor remains valid. Neighbors are searched anew in every step. Points are processed in batches,
+    so memory does not grow with their number. With ``hold_out``, a fraction of the rays is excluded
+    from training, and the parameters of the epoch with the smallest loss on them are kept. The
+    initial map is not a candidate, because `fit` has used those rays. If anything fails, the map is
+    unchanged.
 
     Args:
         model: a fitted map, changed in place.
         points: (N, D) world positions [m].
-        labels: (N,) 1 occupied, 0 free.
-        ray_id: (N,) which ray a point lies on, so that whole rays are held out (`Samples.ray_id`);
-            None: points are held out one by one.
-        resample: number of the epoch, from 1, -> fresh samples of the same rays for it. New free
-            points every epoch cannot be learned by heart:
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+        ray_id: (N,) ray of each point, so that complete rays are held out (`Samples.ray_id`);
+            None: points are held out individually.
+        resample: function that returns new samples of the same rays, given the number of the epoch
+            (from 1). New free points in every epoch reduce overfitting:
             ``lambda epoch: sample_rays(scans, seed=seed + epoch)``.
-        config: rates, epochs and what is tuned.
-        seed: of the hold-out and the batches.
-        state: what ``after_epoch`` was given; tuning goes on from there, and ends as if it had
-            never been interrupted. All other arguments must be the same again.
-        after_epoch: called with the state after every epoch, to be saved.
-        progress: show a bar with the loss on a terminal.
+        config: learning rates, epochs and parameters to optimize; None: the defaults.
+        seed: random seed of the hold-out and the batches.
+        state: state passed to ``after_epoch`` in an earlier run, which is resumed. The result is that
+            of an uninterrupted run if all other arguments are the same.
+        after_epoch: callback that receives the state after every epoch, e.g. to save it.
+        progress: show a progress bar on a terminal.
 
     Returns:
-        Mean balanced log-loss of held-out points (of training points if none are held out), before
-        the first epoch and after each.
+        Mean balanced log-loss on held-out points (on training points if none are held out), before
+        the first epoch and after each epoch.
 
     Raises:
-        ValueError: the map is empty, nothing is to be tuned, the samples are bad (see `fit`), or
-            the state is of another map or config.
+        ValueError: the map is empty, no parameter is to be optimized, the samples are invalid (see
+            `fit`), or the state belongs to a different map or config.
     """
     config = config or TuneConfig()
     if len(model) == 0:
@@ -80,9 +82,9 @@ def fine_tune(
         )
     rng = seeded_generator(seed, "fine_tune", model.origin.device)
     held_rays = _hold_out(samples, config.hold_out, rng)
-    train, judged = _divide(samples, held_rays)
+    train, evaluation = _divide(samples, held_rays)
     run = TuningRun(model, config, rng)
-    run.load(state) if state else run.losses.append(run.judge(judged))
+    run.load(state) if state else run.losses.append(run.evaluate(evaluation))
     with tqdm(total=config.epochs, initial=run.epoch, disable=None if progress else True) as bar:
         while run.epoch < config.epochs and not run.stalled():
             if resample and run.epoch:
@@ -90,7 +92,7 @@ def fine_tune(
                 fresh_samples = _check(model, fresh.points, fresh.labels, fresh.ray_id)
                 train = _divide(fresh_samples, held_rays)[0]
             run.train(train)
-            run.keep_best(run.judge(judged))
+            run.keep_best(run.evaluate(evaluation))
             bar.set_postfix(loss=f"{run.losses[-1]:.4f}")
             bar.update()
             if after_epoch:
@@ -116,49 +118,49 @@ def _check(
     return LabelledPoints(points, labels, ray_id)
 
 
-def _hold_out(samples: LabelledPoints, share: float, rng: torch.Generator) -> Tensor | None:
-    """A random share of the rays, by their id (of the points, by their row); None for none."""
-    if not share:
+def _hold_out(samples: LabelledPoints, fraction: float, rng: torch.Generator) -> Tensor | None:
+    """IDs of a random fraction of the rays, or rows of points without ray IDs; None if none or all."""
+    if not fraction:
         return None
     rays = samples.ray_id
     ids = torch.arange(len(samples.labels), device=rng.device) if rays is None else rays.unique()
-    held = ids[torch.rand(len(ids), generator=rng, device=rng.device) < share]
+    held = ids[torch.rand(len(ids), generator=rng, device=rng.device) < fraction]
     return held if 0 < len(held) < len(ids) else None
 
 
 def _divide(
     samples: LabelledPoints, held_rays: Tensor | None
 ) -> tuple[LabelledPoints, LabelledPoints]:
-    """What trains, and what is judged: the held-out points, or a part of the training points."""
+    """Training points, and evaluation points: held-out points, or a subset of the training points."""
     if held_rays is None:
-        train = judged = samples
+        train = evaluation = samples
     else:
         positions, labels, rays = samples
         rays = torch.arange(len(labels), device=labels.device) if rays is None else rays
         held = torch.isin(rays, held_rays)
         train = LabelledPoints(positions[~held], labels[~held], None)
-        judged = LabelledPoints(positions[held], labels[held], None)
-    every = -(-len(judged.labels) // JUDGED_POINTS)
-    return train, LabelledPoints(judged.positions[::every], judged.labels[::every], None)
+        evaluation = LabelledPoints(positions[held], labels[held], None)
+    every = -(-len(evaluation.labels) // EVALUATION_POINTS)
+    return train, LabelledPoints(evaluation.positions[::every], evaluation.labels[::every], None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TuneConfig:
-    """How a map is fine-tuned. Rates are in units of each cluster, so they fit every scene.
+    """Settings of fine-tuning. Learning rates are relative to the size of each cluster.
 
-    ``l2`` and ``stiffness`` stand against the sum of the losses of all points.
+    ``l2`` and ``stiffness`` are relative to the summed loss of all points.
     """
 
     epochs: int = 12
-    batch_size: int | None = None  # points a step; None: N / 64, 1024 to `MAX_BATCH`
+    batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
-    center_rate: float = 0.02  # of the cluster's mean length-scale, a step
-    scale_rate: float = 0.02  # of the logarithm of the length-scales, a step
-    l2: float = 0.25  # on the weights
-    stiffness: float = 0.8  # on how far centers and scales have moved, in units of the cluster
-    occupied_share: float = 0.6  # of the loss, see `fitting.FitConfig`
-    hold_out: float = 0.0  # share of the rays that chooses the best epoch; 0 keeps the last
-    patience: int | None = None  # stop after so many epochs without a better held-out loss
+    center_rate: float = 0.02  # per step, relative to the mean length-scale of the cluster
+    scale_rate: float = 0.02  # per step, of the logarithm of the length-scales
+    l2: float = 0.25  # penalty on squared weights
+    stiffness: float = 0.8  # penalty on squared offsets of centers and length-scales
+    occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`
+    hold_out: float = 0.0  # fraction of rays used to select the best epoch; 0: keep the last
+    patience: int | None = None  # stop after this many epochs without improvement
     tune_weights: bool = True
     tune_centers: bool = True
     tune_scales: bool = True
@@ -184,7 +186,7 @@ class TuneConfig:
 
 
 class LabelledPoints(NamedTuple):
-    """(N, D) world positions, (N,) labels and (N,) rays, or None where every point is its own."""
+    """(N, D) world positions [m], (N,) labels, and (N,) ray IDs or None."""
 
     positions: Tensor
     labels: Tensor
@@ -192,7 +194,7 @@ class LabelledPoints(NamedTuple):
 
 
 class TuningRun:
-    """A map's parameters as offsets in units of each cluster, which is what Adam moves."""
+    """State of an optimization run. Adam optimizes offsets in units of the cluster size."""
 
     def __init__(self, model: MapParameters, config: TuneConfig, rng: torch.Generator) -> None:
         self.model, self.config, self.rng = model, config, rng
@@ -204,7 +206,7 @@ class TuningRun:
         size = start[2].diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
         size = self.model.covariance_scale**0.5 * size.clamp(min=self.model.min_lengthscale)
         eye = torch.eye(self.model.dim, dtype=torch.bool, device=size.device)
-        self.units = [  # (M, 1) is the mean length-scale of a cluster's kernel [m]
+        self.units = [  # size: (M, 1) mean length-scale of the kernels [m]
             torch.ones_like(start[0]),
             size,
             torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),
@@ -224,21 +226,21 @@ class TuningRun:
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def parameters_of_map(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The map's own tensors, in the order of the offsets."""
+        """The parameters of the map, in the order of the offsets."""
         return self.model.weights, self.model.centers, self.model.raw_scale_tril
 
     def current(self) -> list[Tensor]:
-        """Weights, centers and raw factors where the offsets have moved them."""
+        """Weights, centers and raw factors with the current offsets applied."""
         rows = zip(self.start, self.units, self.offsets, strict=True)
         return [start + unit * offset for start, unit, offset in rows]
 
     def log_odds(self, points: Tensor, weights: Tensor, centers: Tensor, raw: Tensor) -> Tensor:
-        """(B, D) world positions -> (B,) logits of the map with these parameters."""
+        """(B, D) world positions [m] -> (B,) log-odds of the map with the given parameters."""
         local = to_map_frame(points, self.model.origin, centers.dtype)
         return native.occupancy(local, centers, raw, weights, self.model.kernel, probability=False)
 
     def train(self, samples: LabelledPoints) -> None:
-        """One epoch over the points."""
+        """Train for one epoch over the points."""
         config, count = self.config, len(samples.labels)
         batch_size = config.batch_size or min(MAX_BATCH, max(1024, count // 64))
         factors = label_factors(samples.labels, config.occupied_share).to(self.start[0])
@@ -254,14 +256,14 @@ class TuningRun:
             self.optimizer.zero_grad()
             (loss + penalty / count).backward()
             for group in self.optimizer.param_groups:
-                group["lr"] = group["full_rate"] * _rate_share(self.step, total_steps)
+                group["lr"] = group["full_rate"] * _rate_fraction(self.step, total_steps)
             self.optimizer.step()
             self.step += 1
         self.epoch += 1
 
     @torch.no_grad()
-    def judge(self, samples: LabelledPoints) -> float:
-        """Mean balanced log-loss of the points."""
+    def evaluate(self, samples: LabelledPoints) -> float:
+        """Mean balanced log-loss on the points."""
         current = self.current()
         chunks = samples.positions.split(MAX_BATCH)
         answer = torch.cat([self.log_odds(chunk, *current) for chunk in chunks])
@@ -269,18 +271,18 @@ class TuningRun:
         return float(logistic_loss(answer, labels, balance_classes(labels))) / len(answer)
 
     def keep_best(self, loss: float) -> None:
-        """Note the loss of the epoch, and its parameters if no epoch was better."""
+        """Record the loss of the epoch, and its parameters if the loss is the smallest so far."""
         self.losses.append(loss)
         if not self.config.hold_out or loss <= min(self.losses[1:]):
             self.best = [value.detach().clone() for value in self.current()]
 
     def stalled(self) -> bool:
-        """Whether the last ``patience`` epochs brought nothing better."""
+        """Whether the loss has not improved for ``patience`` epochs."""
         patience, losses = self.config.patience, self.losses[1:]
         return patience is not None and len(losses) - 1 - _last_best(losses) >= patience
 
     def state(self) -> State:
-        """All that a run is, as tensors and plain values."""
+        """State of the run as tensors and plain Python values."""
         return {
             "config": asdict(self.config),
             "epoch": self.epoch,
@@ -294,7 +296,7 @@ class TuningRun:
         }
 
     def load(self, state: State) -> None:
-        """Go on where a state was taken."""
+        """Resume from a state."""
         if state["config"] != asdict(self.config):
             raise ValueError(f"state must be of this config; got one of {state['config']}")
         shapes = [value.shape for value in state["start"]]
@@ -319,19 +321,20 @@ def _last_best(losses: list[float]) -> int:
 
 
 def batches(count: int, batch_size: int, rng: torch.Generator) -> Iterator[Tensor]:
-    """Every row once, in batches that each hold one row of every stretch of the rows.
+    """Yield stratified batches that together contain every row once.
 
-    Samples come hits first and ray by ray, so each batch sees both classes and the whole scene in
-    fair shares; and nothing as long as the rows is held.
+    The rows are divided into runs of consecutive rows, and each batch contains one row of every run.
+    Samples are ordered by class and ray, so each batch represents both classes and the whole scene in
+    proportion. No index tensor of the length of the data is created.
     """
     steps = -(-count // batch_size)
-    first = torch.arange(0, count, steps, device=rng.device)  # of each stretch of `steps` rows
+    first = torch.arange(0, count, steps, device=rng.device)  # first row of each run
     shift = torch.randint(steps, first.shape, generator=rng, device=rng.device)
     for turn in torch.randperm(steps, generator=rng, device=rng.device):
         rows = first + (shift + turn) % steps
         yield rows[rows < count]
 
 
-def _rate_share(step: int, total_steps: int) -> float:
-    """Share of the full rate: a short rise, then down to 0."""
+def _rate_fraction(step: int, total_steps: int) -> float:
+    """Fraction of the full learning rate: a short warm-up, and a linear decay to 0."""
     return min(1.0, (step + 1) / WARM_UP_STEPS) * max(0.0, 1 - step / total_steps)

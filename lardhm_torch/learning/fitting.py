@@ -1,4 +1,4 @@
-"""All samples at once: clusters, then weights by stochastic gradient descent (eq. 2 to 4)."""
+"""Batch training of a map: clustering, then stochastic gradient descent on the weights (eq. 2-4)."""
 
 from __future__ import annotations
 
@@ -16,43 +16,43 @@ from lardhm_torch.learning.clustering import cluster_classes
 from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.unseen import settle_unknown
 
-CHUNK_ROWS = 1 << 21  # points whose features are computed at a time
-PASSES, MIN_STEPS = 4, 256  # a few beams make a single batch: four steps would teach nothing
-CACHE_BYTES = 1 << 28  # features are kept for all passes up to this size
-State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the slope
+CHUNK_ROWS = 1 << 21  # number of points whose features are computed at a time
+PASSES, MIN_STEPS = 4, 256  # small data sets need more passes for enough steps
+CACHE_BYTES = 1 << 28  # upper bound on the size of the feature cache
+State = tuple[Tensor, Tensor, Tensor]  # weights, running mean and mean square of the gradient
 FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """How the weights are trained.
+    """Training settings of the weights.
 
-    The defaults train to convergence. The paper's own setting, one pass at a constant rate without
+    The defaults train to convergence. The setting of the paper, one pass at a constant rate without
     preconditioner, is ``FitConfig(passes=1, learning_rate=0.1, decay=False, preconditioner=False,
-    batch_size=1)``; it leaves log-loss on the table (docs and benchmarks show how much).
+    batch_size=1)``; its log-loss is higher (see docs and benchmarks).
     """
 
-    passes: int | None = None  # over all points; None: 4, or as many as make `MIN_STEPS` steps
-    batch_size: int | None = None  # points a step; None: N / 128, at least 256
-    learning_rate: float = 0.5  # eta of eq. (4)
+    passes: int | None = None  # over all points; None: 4, or more to reach `MIN_STEPS` steps
+    batch_size: int | None = None  # points per step; None: N / 128, at least 256
+    learning_rate: float = 0.5  # eta in eq. (4)
     decay: bool = True  # eta falls linearly to 0; otherwise constant
-    preconditioner: bool = True  # A of eq. (4): running root mean square gradient; else identity
-    l2: float = 0.03  # lambda_1 of eq. (2), against the sum of the losses of all points
-    l1: float = 0.0  # lambda_2 of eq. (2), by soft thresholding: weights become exactly 0
-    balance: bool = True  # the classes share the loss in a fixed way, however few their points
-    # The occupied class's share where classes are balanced. More than half, because hits are few
-    # and free points many: what is learned of hits carries over to unseen rays less surely.
+    preconditioner: bool = True  # A in eq. (4): running root mean square gradient; else identity
+    l2: float = 0.03  # lambda_1 in eq. (2), relative to the summed loss of all points
+    l1: float = 0.0  # lambda_2 in eq. (2), by soft thresholding, so weights can be exactly 0
+    balance: bool = True  # weight the classes independently of their numbers of points
+    # Class weight of occupied points, as a fraction of the loss, if classes are balanced. It exceeds
+    # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
-    unknown_share: float = 0.25  # of the unknown points' loss, beside the loss of the two classes
+    unknown_share: float = 0.25  # loss of unknown points, relative to all others
 
-    def rows_a_batch(self, num_points: int) -> int:
-        """Points a step: about ``batch_size``, such that all batches of a pass are equally large."""
+    def rows_per_batch(self, num_points: int) -> int:
+        """Points per step: about ``batch_size``, with equally large batches in each pass."""
         wanted = self.batch_size or max(256, num_points // 128)
         return -(-num_points // -(-num_points // wanted)) if num_points else wanted
 
     def passes_over(self, num_points: int) -> int:
-        """Passes over so many points."""
-        batches = max(1, -(-num_points // self.rows_a_batch(num_points)))
+        """Number of passes over ``num_points`` points."""
+        batches = max(1, -(-num_points // self.rows_per_batch(num_points)))
         return self.passes or max(PASSES, -(-MIN_STEPS // batches))
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class FitConfig:
 
 
 class FitTask(NamedTuple):
-    """What a fit needs beside the samples."""
+    """Settings and random generator of a fit."""
 
     kernel: Kernel
     config: FitConfig
@@ -82,20 +82,21 @@ class FitTask(NamedTuple):
 def fit_clusters(
     points: Tensor, labels: Tensor, num_clusters: int | None, task: FitTask
 ) -> MapState:
-    """Clusters of the samples, each class on its own, with trained weights.
+    """Cluster each class of the samples separately and train the weights.
 
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
         labels: (N,) 1 occupied, 0 free, 1/2 unknown, of the points' dtype.
         num_clusters: total over both classes; None: chosen from the data.
-        task: kernel, settings, random state.
+        task: kernel, settings, random generator.
 
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
     clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
     columns = settle_unknown(points, labels, state, task.kernel, task.rng)
-    points, labels = deal_samples(columns, task.config.rows_a_batch(len(columns[0])), task.rng)
+    batch_size = task.config.rows_per_batch(len(columns[0]))
+    points, labels = stratified_batches(columns, batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def features_of(rows: slice) -> tuple[Tensor, Tensor]:
@@ -106,19 +107,22 @@ def fit_clusters(
     return replace(state, weights=weights)
 
 
-def deal_samples(
+def stratified_batches(
     columns: tuple[Tensor, ...], batch_size: int, rng: torch.Generator
 ) -> tuple[Tensor, ...]:
-    """Samples along a space-filling curve -> the same in the order `fit_weights` should take them.
+    """Reorder samples from Morton order into consecutive stratified mini-batches, for `fit_weights`.
 
-    They are dealt out to the batches in turn, each round from another random batch on. So every
-    batch is a sample of all space, more even than a random one, and its neighbors in space lie next
-    to each other in memory.
+    With B batches, each run of B consecutive samples contributes one sample to every batch, with a
+    random rotation per run. Every batch therefore covers all space, more evenly than a random sample,
+    and within a batch samples that are close in space are close in memory.
 
     Args:
         columns: (N, ...) positions, labels or features of the samples, in the order of `morton_order`.
-        batch_size: samples a batch.
-        rng: random state.
+        batch_size: samples per batch.
+        rng: random generator.
+
+    Returns:
+        (N, ...) the same columns, batch after batch.
     """
     count = len(columns[0])
     batches = max(1, -(-count // batch_size))
@@ -129,19 +133,19 @@ def deal_samples(
     sizes = torch.bincount(batch, minlength=batches)
     place = (sizes.cumsum(0) - sizes)[batch]
     place += torch.arange(count, device=rng.device) // batches
-    # Reading in order and writing to all batches at once is several times faster than a gather.
+    # Sequential reads with scattered writes are several times faster than a gather.
     return tuple(torch.empty_like(column).index_copy_(0, place, column) for column in columns)
 
 
 def class_factors(free: Tensor, occupied: Tensor, occupied_share: float = 0.5) -> Tensor:
-    """(2,) loss factors of a free and an occupied point, so that the classes share the loss.
+    """(2,) loss factors of a free and an occupied point that balance the classes.
 
-    Over all points they have mean 1. With a single class present both are 1.
+    The mean over all points is 1. If only one class is present, both factors are 1.
 
     Args:
-        free: () how many points are free, or what they count.
-        occupied: () the same of the occupied points.
-        occupied_share: of the loss.
+        free: () number, or total weight, of the free points.
+        occupied: () number, or total weight, of the occupied points.
+        occupied_share: class weight of the occupied points, as a fraction of the loss.
     """
     total = free + occupied
     balanced = total * torch.stack([(1 - occupied_share) / free, occupied_share / occupied])
@@ -153,7 +157,8 @@ def label_factors(
 ) -> Tensor:
     """(N,) labels -> (3,) loss factors of a free, an unknown and an occupied point, float64.
 
-    Those of `class_factors`; the unknown points together count ``unknown_share`` of the others.
+    The first and last are those of `class_factors`. The total weight of the unknown points is
+    ``unknown_share`` times that of all others.
     """
     occupied = (labels > 0.5).sum().double()
     unknown = (labels == 0.5).sum().double()
@@ -173,7 +178,7 @@ def balance_classes(
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
     """Sum of the points' negative log-likelihoods, the data term of eq. (3).
 
-    Eq. (3) as printed lacks the logarithm that eq. (2) asks for; this has it.
+    Eq. (3) as printed lacks the logarithm required by eq. (2); it is included here.
     """
     loss = torch.nn.functional.binary_cross_entropy_with_logits
     return loss(log_odds, labels, factors, reduction="sum")
@@ -187,21 +192,21 @@ def fit_weights(
     progress: bool = False,
     factors: Tensor | None = None,
 ) -> Tensor:
-    """Weights that minimize the regularized loss, from the given start.
+    """Minimize the regularized loss by stochastic gradient descent from the given weights.
 
-    w <- w - eta_t A^-1 g, with g the gradient of a batch scaled to all points. The preconditioner
-    A is the running root mean square of g, and g is smoothed over steps (Adam), so that weights of
-    rarely seen clusters learn as fast as others. Points are taken in the order given: bring them
-    into that of `deal_samples` first. Features are computed once and kept up to `CACHE_BYTES`,
-    the others anew for every two passes, which then come at once.
+    w <- w - eta_t A^-1 g, where g is the gradient of a batch scaled to all points. The preconditioner
+    A is the running root mean square of g, and g is averaged over steps (Adam), so that weights of
+    rarely observed clusters converge as fast as others. Points are used in the given order, which
+    should be that of `stratified_batches`. Features are cached up to `CACHE_BYTES`. For chunks that
+    do not fit, features are computed once per two passes, which are then run back to back.
 
     Args:
-        features_of: slice of B rows -> indices (B, K) and kernel values (B, K) of those points.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown, in the order of `deal_samples`.
-        weights: (M,) start, left as it is.
+        features_of: function of a slice of B rows that returns (B, K) indices and kernel values.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown, in the order of `stratified_batches`.
+        weights: (M,) initial weights; not modified.
         config: passes, rates and regularizer.
-        progress: show a bar on a terminal.
-        factors: (N,) what each point's loss counts, mean 1; None: as the config says.
+        progress: show a progress bar on a terminal.
+        factors: (N,) loss factor of each point, mean 1; None: determined by ``config``.
 
     Returns:
         (M,) weights.
@@ -209,9 +214,11 @@ def fit_weights(
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
     if factors is None:
-        shares = (config.occupied_share, config.unknown_share)
-        factors = balance_classes(labels, *shares) if config.balance else torch.ones_like(labels)
-    batch_size = config.rows_a_batch(len(labels))
+        class_weights = (config.occupied_share, config.unknown_share)
+        factors = (
+            balance_classes(labels, *class_weights) if config.balance else torch.ones_like(labels)
+        )
+    batch_size = config.rows_per_batch(len(labels))
     passes = config.passes_over(len(labels))
     plan = _Plan(config, batch_size, len(labels), passes * -(-len(labels) // batch_size))
     features = _Features(features_of, batch_size * max(1, CHUNK_ROWS // batch_size))
@@ -237,7 +244,7 @@ class _Plan(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    """Some whole batches: (R, K) features, (R,) labels and loss factors."""
+    """A number of complete batches: (R, K) features, (R,) labels and loss factors."""
 
     indices: Tensor
     values: Tensor
@@ -246,12 +253,12 @@ class _Chunk(NamedTuple):
 
 
 class _Features:
-    """Features of chunks of rows; as many as fit are kept."""
+    """Features of chunks of rows, with a cache of bounded size."""
 
     def __init__(self, features_of: FeaturesOf, chunk_rows: int) -> None:
         self.features_of, self.chunk_rows = features_of, chunk_rows
-        self.kept: dict[int, tuple[Tensor, Tensor]] = {}
-        self.room = CACHE_BYTES
+        self.cache: dict[int, tuple[Tensor, Tensor]] = {}
+        self.free_bytes = CACHE_BYTES
 
     def chunks(self, num_rows: int) -> Iterator[slice]:
         """Slices that cover all rows, in order."""
@@ -259,23 +266,23 @@ class _Features:
             yield slice(start, min(num_rows, start + self.chunk_rows))
 
     def keeps(self, rows: slice) -> bool:
-        """Whether the features of a chunk are at hand."""
-        return rows.start in self.kept
+        """Whether the features of a chunk are cached."""
+        return rows.start in self.cache
 
     def __getitem__(self, rows: slice) -> tuple[Tensor, Tensor]:
         """Indices and kernel values (R, K) of one chunk."""
         if self.keeps(rows):
-            return self.kept[rows.start]
+            return self.cache[rows.start]
         found = self.features_of(rows)
         size = sum(tensor.numel() * tensor.element_size() for tensor in found)
-        if size <= self.room:
-            self.kept[rows.start] = found
-            self.room -= size
+        if size <= self.free_bytes:
+            self.cache[rows.start] = found
+            self.free_bytes -= size
         return found
 
 
 def _plain_steps(chunk: _Chunk, state: State, step: int, plan: _Plan) -> State:
-    """A step for every batch of the chunk: the definition."""
+    """One step for every batch of the chunk, in plain torch."""
     config = plan.config
     batches = zip(*(tensor.split(plan.batch_size) for tensor in chunk), strict=True)
     for step_now, (indices, values, labels, factors) in enumerate(batches, start=step):
@@ -286,7 +293,7 @@ def _plain_steps(chunk: _Chunk, state: State, step: int, plan: _Plan) -> State:
 
 
 def _native_steps(chunk: _Chunk, state: State, step: int, plan: _Plan) -> State:
-    """The same in the native library."""
+    """The same as `_plain_steps`, in the native library."""
     config = plan.config
     return torch.ops.lardhm.descent(
         *chunk, *state, plan.num_points, plan.batch_size, step, plan.total_steps,
@@ -300,33 +307,33 @@ def batch_gradient(
     """(M,) gradient of the batch's loss with respect to the weights: Phi^T (p - y)."""
     log_odds = (values * weights[indices]).sum(dim=1)
     residuals = factors * (torch.sigmoid(log_odds) - labels)
-    pulls = (residuals[:, None] * values).reshape(-1)
-    return torch.zeros_like(weights).index_add_(0, indices.reshape(-1), pulls)
+    terms = (residuals[:, None] * values).reshape(-1)
+    return torch.zeros_like(weights).index_add_(0, indices.reshape(-1), terms)
 
 
 def descend(
     state: State, slope: Tensor, step: int, rate: float, num_points: int, config: FitConfig
 ) -> State:
-    """One step of eq. (4) on the mean loss; l1 acts as a soft threshold after it.
+    """One step of eq. (4) on the mean loss, followed by a soft threshold if ``l1`` > 0.
 
     Args:
-        state: (M,) weights and the running mean and mean square of the slope.
+        state: (M,) weights, running mean and running mean square of the gradient.
         slope: (M,) gradient of the batch's mean loss.
         step: number of this step, from 1.
         rate: eta_t.
-        num_points: N, over which the regularizer is spread.
+        num_points: N; the regularizer is divided by it.
         config: regularizer and preconditioner.
     """
     weights, mean, square = state
     slope = slope + 2 * config.l2 / num_points * weights
     if not config.preconditioner:
-        moved, reach = weights - rate * slope, torch.full_like(weights, rate)
+        moved, step_size = weights - rate * slope, torch.full_like(weights, rate)
     else:
         mean = 0.9 * mean + 0.1 * slope
         square = 0.99 * square + 0.01 * slope.square()
-        reach = rate / ((square / (1 - 0.99**step)).sqrt() + 1e-10)
-        moved = weights - reach * mean / (1 - 0.9**step)
+        step_size = rate / ((square / (1 - 0.99**step)).sqrt() + 1e-10)
+        moved = weights - step_size * mean / (1 - 0.9**step)
     if config.l1:
-        threshold = reach * config.l1 / num_points
+        threshold = step_size * config.l1 / num_points
         moved = moved.sign() * (moved.abs() - threshold).clamp(min=0)
     return moved, mean, square

@@ -1,4 +1,4 @@
-"""Whole maps moved, cut and joined: loop closures, constant memory, several robots."""
+"""Rigid transform, cropping and merging of complete maps."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
-from lardhm_torch.learning.replay import Evidence, join_evidence, learn, recalled_evidence
+from lardhm_torch.learning.replay import Evidence, join_evidence, learn, replay_evidence
 from lardhm_torch.sampling import seeded_generator
 
 AnyMap = TypeVar("AnyMap", bound=MapParameters)
 
-ZETA = 1.0  # [m] clusters of two maps that are farther apart never match (Algorithm 2)
-RECALLED = 16  # points drawn from each cluster to see whether two maps contradict each other
-TOLERANCE = 0.01  # of a probability: what the joined map may differ from a map it was made of
+ZETA = 1.0  # [m] maximum distance of matching clusters (zeta in Algorithm 2)
+SAMPLES_PER_CLUSTER = 16  # number of pseudo-samples per cluster
+TOLERANCE = 0.01  # accepted change of a probability by merging
 
 
 def moved(
     state: MapState, origin: Tensor, rotation: Tensor, translation: Tensor
 ) -> tuple[MapState, Tensor]:
-    """Clusters and origin after x -> rotation x + translation in the world frame.
+    """Clusters and origin after the rigid transform x -> rotation x + translation.
 
-    Means become R z + t and covariances R S R^T, exactly: no probability changes but where it is.
+    Means become R z + t and covariances R S R^T, so the transformed map is exact.
 
     Args:
         state: M clusters.
@@ -64,22 +64,22 @@ def moved(
     new_origin = place.round()  # whole meters, as in `fit`
     shift = place - new_origin
 
-    def turned(points: Tensor) -> Tensor:
+    def transformed(points: Tensor) -> Tensor:
         return (points.double() @ rotation.T + shift).to(points.dtype)
 
     scatters = rotation @ state.scatters.double() @ rotation.T
     after = replace(
         state,
-        centers=turned(state.centers),
-        raw_scale_tril=_turned_factors(state.raw_scale_tril, rotation),
-        means=turned(state.means),
+        centers=transformed(state.centers),
+        raw_scale_tril=_rotated_factors(state.raw_scale_tril, rotation),
+        means=transformed(state.means),
         scatters=scatters.to(state.scatters.dtype),
     )
     return after, new_origin
 
 
-def _turned_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
-    """Raw factors of R L L^T R^T: the triangle of the QR decomposition of (R L)^T."""
+def _rotated_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
+    """Raw Cholesky factors of R L L^T R^T, from the QR decomposition of (R L)^T."""
     diagonal = raw_scale_tril.double().diagonal(dim1=-2, dim2=-1).exp()
     factors = raw_scale_tril.double().tril(-1) + torch.diag_embed(diagonal)
     upper = torch.linalg.qr((rotation @ factors).mT, mode="r").R
@@ -88,7 +88,7 @@ def _turned_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
 
 
 def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
-    """A center as a (D,) float64 tensor, world frame [m].
+    """Validate a sphere; return its center as a (D,) float64 tensor, world frame [m].
 
     Raises:
         ValueError: center is not (D,) and finite, or radius is not > 0.
@@ -102,24 +102,24 @@ def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
 
 
 def within(state: MapState, center: Tensor, radius: float) -> MapState:
-    """The clusters whose centers are at most ``radius`` [m] from a position in the map's frame."""
+    """The clusters whose centers are within ``radius`` [m] of a position in the map frame."""
     return state.rows(torch.linalg.vector_norm(state.centers - center, dim=1) <= radius)
 
 
 def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
-    """One map of two, in the frame of the first; both stay as they are.
+    """Merge two maps into a new map in the frame of the first. The given maps are not modified.
 
-    Clusters that match by Algorithm 2 are pooled, with weights and centers averaged by the number
-    of points behind them; all others are taken over. Where the joined map then answers otherwise
-    than the maps it was made of, its weights are trained on what both recall, each counting by its
-    points. Maps that do not overlap are put side by side unchanged, and a map merged with itself
-    answers as before.
+    Clusters that match by Algorithm 2 are merged, with weights and centers averaged in proportion to
+    their numbers of points; all other clusters are copied. Where the probability of the merged map
+    deviates from that of the given maps, its weights are trained on pseudo-samples drawn from both
+    maps. Maps that do not overlap are combined unchanged, and merging a map with itself does not
+    change its probabilities.
 
     Args:
         first: a `LardHilbertMap`.
-        second: another with the same settings; its points are in the same world frame (see
+        second: another map with the same settings and world frame (see
             `LardHilbertMap.transform`).
-        seed: of the recalled points and the training.
+        seed: random seed of the pseudo-samples and the training.
 
     Returns:
         A new map, in the frame of the first.
@@ -127,7 +127,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     Raises:
         ValueError: the settings differ.
 
-    Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, between maps.
+    Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, applied to two maps.
     """
     if first.settings != second.settings:
         raise ValueError(
@@ -146,15 +146,15 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     theirs = replace(theirs, centers=theirs.centers + shift, means=theirs.means + shift)
     rng = seeded_generator(seed, "merge_maps", shift.device)
     pooled = _pooled(ours, theirs, first.kernel)
-    write_state(joined, _settled(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
+    write_state(joined, _retrained(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
     return joined
 
 
 def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
-    """Matching clusters pooled, the others of both side by side.
+    """Merge matching clusters, and append the other clusters of the second map.
 
-    Factors move by the change of the covariances with all points in the denominator: those of two
-    equal clusters are equal to that of their union.
+    Factors are changed by the change of the biased covariances (scatter / count), because merging two
+    equal clusters does not change the biased covariance.
     """
     floor = kernel.min_lengthscale
     match = match_clusters(ours, theirs.clusters, theirs.is_occupied, ZETA, floor)
@@ -164,11 +164,11 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
     rows = torch.cat([torch.arange(len(where), device=groups.device), groups])
     clusters = concatenate_clusters([before.clusters, others.clusters])
     pooled = pool_clusters(clusters, rows, len(where))
-    share = clusters.counts / pooled.counts[rows]
+    fraction = clusters.counts / pooled.counts[rows]
 
     def average(mine: Tensor, other: Tensor) -> Tensor:
         values = torch.cat([mine, other])
-        shaped = share.to(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
+        shaped = fraction.to(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
         return torch.zeros_like(mine).index_add_(0, rows, shaped * values)
 
     spreads = [
@@ -189,11 +189,11 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
     return ours.put(where, tail)
 
 
-def _settled(
+def _retrained(
     joined: MapState, ours: MapState, theirs: MapState, kernel: Kernel, rng: torch.Generator
 ) -> MapState:
-    """The joined clusters with new weights wherever they contradict the maps they come from."""
-    evidence = join_evidence([_everything(state, kernel, rng) for state in (ours, theirs)])
+    """Retrain the weights of the merged map where it deviates from the original maps."""
+    evidence = join_evidence([_map_evidence(state, kernel, rng) for state in (ours, theirs)])
     tensors = (joined.centers, joined.raw_scale_tril, joined.weights, kernel)
     index = native.build_index(joined.centers, kernel.num_neighbors)
     probability = native.occupancy(evidence.points, *tensors, probability=True, index=index)
@@ -208,8 +208,9 @@ def _settled(
     return replace(joined, weights=torch.where(open_rows, learned, joined.weights))
 
 
-def _everything(state: MapState, kernel: Kernel, rng: torch.Generator) -> Evidence:
-    """What a whole map recalls, each cluster counting by its points."""
+def _map_evidence(state: MapState, kernel: Kernel, rng: torch.Generator) -> Evidence:
+    """Pseudo-samples of a complete map, weighted by the number of points of each cluster."""
     rows = torch.arange(len(state), device=state.weights.device)
-    strength = (state.counts / RECALLED).to(state.weights.dtype)[:, None].expand(-1, RECALLED)
-    return recalled_evidence(state, rows, kernel, strength, rng)
+    strength = (state.counts / SAMPLES_PER_CLUSTER).to(state.weights.dtype)[:, None]
+    strength = strength.expand(-1, SAMPLES_PER_CLUSTER)
+    return replay_evidence(state, rows, kernel, strength, rng)

@@ -1,4 +1,4 @@
-"""The clusters of a map as plain tensors, one row each."""
+"""The clusters of a map as plain tensors with one row per cluster."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lardhm_torch.learning.clustering import Clusters, Columns
 
 @dataclass(frozen=True, eq=False)
 class MapState(Columns):
-    """Everything a map knows but its origin: M rows each (see `LardHilbertMap`)."""
+    """All tensors of a map except its origin, with M rows each (see `LardHilbertMap`)."""
 
     weights: Tensor
     centers: Tensor
@@ -24,12 +24,12 @@ class MapState(Columns):
     scatters: Tensor
 
     def rows(self, which: Tensor) -> MapState:
-        """The clusters of a mask or of indices, in that order, as copies."""
+        """Copies of the clusters selected by a mask or by indices, in that order."""
         which = which.nonzero().squeeze(1) if which.dtype == torch.bool else which
         return MapState(*(tensor.index_select(0, which) for tensor in self))
 
     def put(self, where: Tensor, part: MapState) -> MapState:
-        """A copy with the first rows of ``part`` in the places ``where`` and its others at the end."""
+        """A copy with rows ``where`` replaced by the first rows of ``part``, and its others appended."""
         count = len(where)
         return MapState(
             *(
@@ -44,16 +44,16 @@ class MapState(Columns):
 
     @property
     def clusters(self) -> Clusters:
-        """The moments."""
+        """The moments of the clusters."""
         return Clusters(self.counts, self.means, self.scatters)
 
 
 def new_rows(clusters: Clusters, is_occupied: Tensor, floor: float) -> MapState:
-    """Rows of new clusters: centers and length-scales from their moments, weights of 0.
+    """Rows of new clusters, with centers and length-scales from their moments and weights of 0.
 
     Args:
         clusters: M clusters.
-        is_occupied: (M,) bool, their class.
+        is_occupied: (M,) bool, class of each cluster.
         floor: smallest standard deviation [m], see `map_state.factor_covariances`.
     """
     factors = factor_covariances(clusters.covariances, floor)
@@ -62,11 +62,11 @@ def new_rows(clusters: Clusters, is_occupied: Tensor, floor: float) -> MapState:
 
 
 def factor_covariances(covariances: Tensor, floor: float) -> Tensor:
-    """Lower Cholesky factors, valid for flat, line-like and single-point clusters too.
+    """Regularized lower Cholesky factors; also valid for planar, linear and single-point clusters.
 
-    ``floor``^2 is added to every variance: no axis is thinner than ``floor``, a single point
-    becomes a ball of that size, and wide clusters hardly change. A relative 1e-6 of the largest
-    variance keeps long thin clusters factorable in float32.
+    ``floor``^2 is added to the diagonal, so the standard deviation along every axis is at least
+    ``floor``, and wide clusters hardly change. In addition, 1e-6 of the largest variance is added, so
+    that elongated clusters can be factorized in float32.
 
     Args:
         covariances: (M, D, D) [m^2], positive semi-definite up to rounding.

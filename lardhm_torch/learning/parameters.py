@@ -1,4 +1,4 @@
-"""The tensors of a map as a torch module, and how their number of rows changes in place."""
+"""The tensors of a map as a torch module, with in-place changes of the number of clusters."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.map_state import MapState
 
-OF_THE_WHOLE = ("origin", "posterior_scales")  # tensors that are not a row a cluster
-RESERVE = 0.25  # of a map's clusters: room that a growing map keeps for more
+PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
+SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
 
 
 class MapParameters(nn.Module):
-    """The tensors and settings of a map: everything that is learned, saved and moved to a device.
+    """Tensors and settings of a map: everything in its state dict.
 
     Args and attributes: see `LardHilbertMap`.
     """
@@ -53,9 +53,9 @@ class MapParameters(nn.Module):
         self.min_lengthscale = float(min_lengthscale)
         self._register_empty(dim, device, dtype)
         self._index = torch.empty(0, dtype=torch.uint8)
-        self._reserves: dict[str, tuple[int, int]] = {}  # of `resize`
+        self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self.register_load_state_dict_pre_hook(make_room)
-        self.register_state_dict_post_hook(drop_reserve)
+        self.register_state_dict_post_hook(drop_spare_rows)
 
     def _register_empty(
         self, dim: int, device: torch.device | str | None, dtype: torch.dtype | None
@@ -89,22 +89,22 @@ class MapParameters(nn.Module):
         return len(self.weights)
 
     def __bool__(self) -> bool:
-        """A map is true, also while it is empty."""
+        """True, even if the map is empty."""
         return True
 
     @property
     def scale_tril(self) -> Tensor:
-        """(M, D, D) lower Cholesky factors of the kernels [m], with covariance scale and floor."""
+        """(M, D, D) lower Cholesky factors of the kernels [m], settings of the kernel applied."""
         return kernel_factors(self.raw_scale_tril, self.kernel)
 
     @property
     def kernel(self) -> Kernel:
-        """Number of neighbors, covariance scale and floor of the kernels."""
+        """Number of neighbors, covariance scale and minimum length-scale of the kernels."""
         return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments that make an empty map like this one."""
+        """Constructor arguments of an empty map with the same settings."""
         return {
             "dim": self.dim,
             "num_neighbors": self.num_neighbors,
@@ -118,19 +118,19 @@ class MapParameters(nn.Module):
         yield from self.named_buffers(recurse=False)
 
     def extra_repr(self) -> str:
-        """Settings and size, for `print(model)`."""
+        """Number of clusters and settings, for `print(model)`."""
         settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())
         return f"num_clusters={len(self)}, {settings}"
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Format version and settings, kept in the state dict beside the tensors."""
+        """Format version and settings, stored in the state dict with the tensors."""
         return {"format_version": map_files.FORMAT_VERSION, **self.settings}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Nothing to set: `make_room` has checked that the settings agree."""
+        """Do nothing: `make_room` has already checked that the settings agree."""
 
     def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
-        """`.to()`, `.float()`, `.half()`: everything is cast but the float64 origin."""
+        """Cast all tensors except the origin, which remains float64 (`.to()`, `.float()`, ...)."""
         origin = self.origin
         super()._apply(fn, recurse)
         if self.origin.dtype != torch.float64:
@@ -139,22 +139,22 @@ class MapParameters(nn.Module):
 
 
 def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> None:
-    """Room for another number of clusters; parameters stay the same objects, so optimizers see it.
+    """Change the number of clusters. Parameters remain the same objects, so optimizers stay valid.
 
     Args:
         model: a map.
-        num_clusters: how many clusters it is to have.
-        keep: whether clusters keep their values, and the map a reserve for more to come, so that
-            growing a little, again and again, does not copy the map each time; otherwise all is 0.
+        num_clusters: new number of clusters.
+        keep: True: keep the values of the clusters, and allocate spare capacity, so that repeated
+            small growth does not copy the map each time. False: set all values to 0.
     """
     if len(model) == num_clusters:
         return
     for name, tensor in list(model.state_tensors()):
-        if name in OF_THE_WHOLE:
+        if name in PER_MAP:
             continue
-        room = _longer(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
+        room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
         if isinstance(tensor, nn.Parameter):
-            _give_room(tensor, room)
+            _set_shape(tensor, room)
         else:
             setattr(model, name, room)
 
@@ -163,31 +163,33 @@ def _zeros(tensor: Tensor, rows: int) -> Tensor:
     return tensor.detach().new_zeros(rows, *tensor.shape[1:])
 
 
-def _longer(model: MapParameters, name: str, rows: int) -> Tensor:
-    """The tensor with more or fewer rows, the added ones 0: in its own storage where that is enough.
+def _with_rows(model: MapParameters, name: str, rows: int) -> Tensor:
+    """The tensor with a different number of rows. Added rows are 0.
 
-    Only a reserve that was made here is used: behind another view lies somebody else's memory.
+    The storage is reused if it is large enough and was allocated by this function. Any other storage
+    may be shared with other tensors.
     """
     tensor = getattr(model, name).detach()
     storage, before = tensor.untyped_storage(), len(tensor)
-    made_here = model._reserves.get(name) == (storage.data_ptr(), storage.nbytes())
-    bytes_a_row = tensor.element_size() * tensor[:1].numel() if before else 0
-    if not made_here or not 0 < rows * bytes_a_row <= storage.nbytes():
-        reserve = _zeros(tensor, rows + int(RESERVE * rows))
+    made_here = model._spare_storages.get(name) == (storage.data_ptr(), storage.nbytes())
+    bytes_per_row = tensor.element_size() * tensor[:1].numel() if before else 0
+    if not made_here or not 0 < rows * bytes_per_row <= storage.nbytes():
+        reserve = _zeros(tensor, rows + int(SPARE_FRACTION * rows))
         reserve[: min(rows, before)] = tensor[:rows]
         storage = reserve.untyped_storage()
-        model._reserves[name] = (storage.data_ptr(), storage.nbytes())
+        model._spare_storages[name] = (storage.data_ptr(), storage.nbytes())
         return reserve[:rows]
-    longer = tensor.as_strided((rows, *tensor.shape[1:]), tensor.stride(), 0)
-    longer[before:] = 0
-    return longer
+    resized = tensor.as_strided((rows, *tensor.shape[1:]), tensor.stride(), 0)
+    resized[before:] = 0
+    return resized
 
 
-def _give_room(parameter: nn.Parameter, room: Tensor) -> None:
-    """Another shape for the same parameter, also while answers with a graph are around.
+def _set_shape(parameter: nn.Parameter, room: Tensor) -> None:
+    """Change the shape of a parameter in place, even if it is part of an autograd graph.
 
-    On the way through another dtype autograd forgets the old shape: new graphs get gradients of the
-    new one, and an old graph fails loudly. (`torch.utils.swap_tensors` refuses while a graph lives.)
+    The temporary change of dtype makes autograd discard the old shape. New graphs then compute
+    gradients of the new shape, and backpropagation through an old graph raises an error.
+    (`torch.utils.swap_tensors` fails as long as a graph exists.)
     """
     parameter.grad = None
     parameter.data = room.new_empty(
@@ -197,7 +199,7 @@ def _give_room(parameter: nn.Parameter, room: Tensor) -> None:
 
 
 def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Before a state dict is loaded: check it whole, then take on its number of clusters."""
+    """Pre-hook of `load_state_dict`: validate the state dict and adopt its number of clusters."""
     extra = map_files.check_settings(state.get(prefix + "_extra_state"))
     differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
     if differing:
@@ -214,7 +216,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
         raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
     num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
     for name, tensor in own.items():
-        shape = tensor.shape if name in OF_THE_WHOLE else (num_clusters, *tensor.shape[1:])
+        shape = tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
         if state[prefix + name].shape != torch.Size(shape):
             raise ValueError(
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
@@ -224,7 +226,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
 
 
 def _fill_posterior(state: dict[str, Any], prefix: str) -> None:
-    """Maps saved before there was a posterior have none."""
+    """Add an empty posterior to state dicts of format versions without one."""
     weights = state.get(prefix + "weights")
     if isinstance(weights, Tensor):
         for name in ("posterior_means", "posterior_variances"):
@@ -232,8 +234,8 @@ def _fill_posterior(state: dict[str, Any], prefix: str) -> None:
         state.setdefault(prefix + "posterior_scales", torch.ones(2, dtype=weights.dtype))
 
 
-def drop_reserve(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """After a state dict is made: tensors with a reserve as copies, or `torch.save` would write it."""
+def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
     for name, _tensor in model.state_tensors():
         value = state.get(prefix + name)
         if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
@@ -241,18 +243,18 @@ def drop_reserve(model: MapParameters, state: dict[str, Any], prefix: str, *_: A
 
 
 def read_state(model: MapParameters) -> MapState:
-    """The map's own tensors, detached, not copied."""
+    """The tensors of the map, detached but not copied."""
     return MapState(*(getattr(model, field.name).detach() for field in fields(MapState)))
 
 
 def write_state(model: MapParameters, state: MapState, origin: Tensor) -> None:
-    """Give a map other clusters in another frame: all or, if anything fails, none.
+    """Replace the clusters and the origin of a map. If anything fails, the map is unchanged.
 
-    Parameters stay the same objects, so an optimizer made before goes on (or, if it keeps a state
-    of the old size, fails loudly: see `resize_optimizer`).
+    Parameters remain the same objects, so existing optimizers stay valid. If an optimizer holds state
+    of the old size, its next step raises an error; see `resize_optimizer`.
 
     Args:
-        model: changed in place.
+        model: map, changed in place.
         state: M clusters.
         origin: (D,) float64, world = map + origin [m].
     """
@@ -266,14 +268,14 @@ def write_state(model: MapParameters, state: MapState, origin: Tensor) -> None:
 
 
 def write_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
-    """Give clusters of a map other values and append new ones: all or, if anything fails, none.
+    """Overwrite rows of a map and append new ones. If anything fails, the map is unchanged.
 
-    What it costs depends on the rows that change, not on the size of the map.
+    The cost depends on the number of changed rows, not on the size of the map.
 
     Args:
         model: a map of M clusters.
-        where: (Q,) rows.
-        part: what to write there, and after the first Q rows the clusters to append.
+        where: (Q,) rows to overwrite.
+        part: Q rows to write there, followed by the clusters to append.
     """
     size, before = len(model), read_state(model).rows(where)
     try:
@@ -287,7 +289,7 @@ def write_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
 
 
 def assign_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
-    """Copy rows into a map, tensor by tensor; those after the first ``len(where)`` to its end."""
+    """Copy the first ``len(where)`` rows into rows ``where`` of a map, and the others to its end."""
     count, added = len(where), len(part) - len(where)
     for tensor, rows in zip(read_state(model), part, strict=True):
         tensor.index_copy_(0, where, rows[:count])
@@ -295,7 +297,7 @@ def assign_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
 
 
 def assign_state(model: MapParameters, state: MapState) -> None:
-    """Copy the tensors of a state into a map, one by one; a posterior of the old weights goes."""
+    """Copy the tensors of a state into a map, and reset the posterior of the weights."""
     resize(model, len(state.weights))
     model.posterior_variances.zero_()
     model.posterior_scales.fill_(1.0)
@@ -305,18 +307,18 @@ def assign_state(model: MapParameters, state: MapState) -> None:
 
 
 def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> None:
-    """Make room in an optimizer's state for the clusters that `update` appended.
+    """Extend the state of an optimizer to the clusters that `update` appended.
 
-    An optimizer without a state per parameter (plain SGD) needs nothing after growth; Adam or
-    momentum would fail with a shape mismatch. Old rows keep their state, new ones start at 0.
+    Adam or SGD with momentum would otherwise fail with a shape mismatch; plain SGD has no state.
+    Existing rows keep their state, and new rows start at 0.
 
     Args:
         optimizer: an optimizer of the map's parameters.
         model: the map, after `update`.
 
     Raises:
-        ValueError: the map has fewer clusters than the state: rows are gone (`crop`, `fit`) and
-            which is not known. Make a new optimizer.
+        ValueError: the map has fewer clusters than the state, because `crop` or `fit` removed
+            rows. In this case, create a new optimizer.
     """
     for parameter in model.parameters():
         for name, value in optimizer.state.get(parameter, {}).items():
@@ -336,7 +338,7 @@ def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> 
 def check_settings(
     dim: int, num_neighbors: int, covariance_scale: float, min_lengthscale: float
 ) -> None:
-    """Raise a ValueError if a setting of a map is out of its range."""
+    """Raise a ValueError if a setting of a map is out of range."""
     for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")

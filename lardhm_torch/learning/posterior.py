@@ -1,10 +1,10 @@
-"""How sure a map is: the weights as a Bayesian logistic regression, on functions of tensors.
+"""Uncertainty of a map by Bayesian logistic regression of the weights.
 
 The paper leaves this open (Section IV-A: "can be extended to provide this variance information by
-substituting the LR classifier with a Bayesian regression technique"). The posterior of the weights
-is a Gaussian with one variance for each, so everything costs a multiple of N k. Two kinds of doubt
-become two numbers: where data contradict each other the probability is near 1/2 and the variance
-small; where nothing was observed both say so, the variance being that of the prior.
+substituting the LR classifier with a Bayesian regression technique"). The posterior of the weights is
+a Gaussian with diagonal covariance, so the cost is O(N k). The two kinds of uncertainty can be
+distinguished: where data are contradictory, the probability is near 1/2 and the variance is small;
+where there are no data, the probability is near 1/2 and the variance is that of the prior.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from lardhm_torch.learning.fitting import balance_classes
 
 FeaturesAt = Callable[[Tensor], tuple[Tensor, Tensor]]
 
-PRIOR_VARIANCE = 0.3  # of a weight, and of the log-odds where no cluster reaches; by measurement
-QUERY_CHUNK = 1 << 17  # points whose features are held at a time
-# Of a variance, what moderates a probability: variances of single weights leave out that the weights
-# of overlapping clusters make up for each other, and overstate the doubt. By measurement.
-OWN_SHARE = 1 / 3
-ROUNDS = 3  # of the variational bound; the third changes the variances by less than 2 %
-SCALES = (0.5, 4.0, 43)  # first, last and number of the factors on the log-odds that are tried
-SCALE_POINTS = 50_000  # about as many points choose the factors, evenly taken
-# Powers of the factors that left-out points ask for: of the occupied side's, more on the free side
-# and on both; of the free side's on itself. By measurement on held-out rays of all sets.
-TRUST = (0.3, 0.3, 0.04)
-MAX_LEVERAGE = 0.8  # of one point on its own prediction, beyond which the expansion is not trusted
+PRIOR_VARIANCE = 0.3  # of a weight, and of the log-odds far from all clusters (empirical)
+QUERY_CHUNK = 1 << 17  # number of points processed at a time
+# Factor on the variance in `moderate`. The diagonal posterior ignores that the weights of overlapping
+# clusters are negatively correlated, so it overestimates the variance. Empirical.
+VARIANCE_FACTOR = 1 / 3
+ROUNDS = 3  # of the variational bound; the third round changes variances by less than 2 %
+SCALES = (0.5, 4.0, 43)  # search grid of factors on the log-odds: first, last, number
+SCALE_POINTS = 50_000  # approximate number of points used to choose the factors
+# Exponents that damp the factors found by leave-one-out: effect of the factor of occupied log-odds on
+# the free ones (in addition to the second), on both, and of the free ones on themselves. Chosen
+# empirically on held-out rays of all data sets.
+DAMPING_EXPONENTS = (0.3, 0.3, 0.04)
+MAX_LEVERAGE = 0.8  # upper bound on the leverage term, beyond which the expansion is invalid
 
 
 def weight_variances(
@@ -41,19 +42,20 @@ def weight_variances(
     num_clusters: int,
     prior_variance: float = PRIOR_VARIANCE,
 ) -> Tensor:
-    """(M,) posterior variance of every weight, given the points the weights were trained on.
+    """(M,) posterior variances of the weights, given their training points.
 
     1 / v_m = 1 / v_0 + sum_i 2 lambda(xi_i) phi_im^2, with lambda(xi) = tanh(xi / 2) / (4 xi) and
-    xi_i^2 the expected square of the log-odds at point i: the variational bound on the logistic
-    function. Laplace's p (1 - p) in its place vanishes where the map is sure, and would call the
-    best observed places the least known. Covariances of weights are left out.
+    xi_i^2 the expected square of the log-odds at point i. This is the variational bound on the
+    logistic function. The curvature p (1 - p) of the Laplace approximation vanishes where the map is
+    confident, so it would give the largest variances to the best observed places. Covariances
+    between weights are neglected.
 
     Args:
-        indices: (N, K) clusters that answer for each training point.
+        indices: (N, K) nearest clusters of each training point.
         values: (N, K) their kernel values.
-        log_odds: (N,) of the trained map at these points.
+        log_odds: (N,) log-odds of the trained map at these points.
         num_clusters: M.
-        prior_variance: v_0 of every weight.
+        prior_variance: v_0, prior variance of every weight.
 
     Source: Jaakkola & Jordan 2000, "Bayesian parameter estimation via variational methods", eq.
     (8) and (10), with independent weights.
@@ -70,7 +72,7 @@ def weight_variances(
 
 
 def logistic_curvature(xi: Tensor) -> Tensor:
-    """2 lambda(xi) = tanh(xi / 2) / (2 xi): 1/4 at 0, falling as 1 / (2 xi)."""
+    """2 lambda(xi) = tanh(xi / 2) / (2 xi): 1/4 at 0, asymptotically 1 / (2 xi)."""
     xi = xi.clamp(min=1e-4)
     return torch.tanh(xi / 2) / (2 * xi)
 
@@ -78,17 +80,17 @@ def logistic_curvature(xi: Tensor) -> Tensor:
 def latent_variance(
     indices: Tensor, values: Tensor, variances: Tensor, prior_variance: float = PRIOR_VARIANCE
 ) -> Tensor:
-    """(N,) variance of the log-odds: that of the weights, and the prior's where none reaches.
+    """(N,) variance of the log-odds, from the weights near clusters and from the prior elsewhere.
 
-    sum_m phi_m^2 v_m + v_0 prod_m (1 - phi_m^2). The first part alone vanishes far from all
-    clusters, as if a map were surest where it knows nothing; the second is the remedy of an
-    imagined basis function at the query that no data have touched.
+    sum_m phi_m^2 v_m + v_0 prod_m (1 - phi_m^2). The first term alone would vanish far from all
+    clusters, where the uncertainty is largest. The second term is the contribution of an additional
+    basis function at the query point, whose weight has the prior variance.
 
     Args:
-        indices: (N, K) clusters that answer for each point.
+        indices: (N, K) nearest clusters of each point.
         values: (N, K) their kernel values.
-        variances: (M,) of the weights.
-        prior_variance: v_0.
+        variances: (M,) posterior variances of the weights.
+        prior_variance: v_0, prior variance of every weight.
 
     Source: the augmentation is that of Rasmussen & Quinonero-Candela 2005, "Healing the relevance
     vector machine through augmentation"; the product in place of their per-point posterior is ours.
@@ -107,57 +109,58 @@ def moderate(log_odds: Tensor, variance: Tensor) -> Tensor:
 
 
 def posterior_log_odds(mean: Tensor, scales: Tensor) -> Tensor:
-    """(N,) log-odds of the trained map and (2,) factors, see `posterior_scales` -> posterior mean."""
+    """(N,) log-odds of the trained map and (2,) `posterior_scales` -> (N,) posterior mean."""
     return torch.where(mean < 0, scales[0], scales[1]) * mean
 
 
 def posterior_scales(
     indices: Tensor, values: Tensor, log_odds: Tensor, labels: Tensor, variances: Tensor
 ) -> Tensor:
-    """Factors on free (negative) and on occupied (positive) log-odds, by predicting left-out points.
+    """Factors on free (negative) and occupied (positive) log-odds, from leave-one-out predictions.
 
-    Regularized, early-stopped weights are pulled toward 0 already; moderating them again would
-    shrink twice. On either side the median of sqrt(1 + pi v / 8) over the points undoes the
-    moderation of a typical point. Beyond it the factor grows with the one that has the least
-    balanced log-loss over the moderated leave-one-out predictions, by the powers of `TRUST`: that of
-    the occupied side raises both, that of the free side hardly counts, because training points
-    keep a gap in front of each hit, which makes them easier to tell apart than those of unseen rays.
+    Regularization and early stopping have already shrunk the weights toward 0, and moderation would
+    shrink the log-odds again. For each sign of the log-odds, the factor sqrt(1 + pi v / 8), with the
+    median over the points, compensates for this. It is multiplied by powers of the ratio between the
+    factor with the smallest balanced log-loss of moderated leave-one-out predictions and the
+    compensating factor, with the exponents `DAMPING_EXPONENTS`. The ratio of the occupied points
+    affects both factors, that of the free points has little effect. Training points leave a gap in
+    front of each hit, so free training points are easier to classify than those of unseen rays.
 
-    Leaving point i out moves its log-odds by h_i (p_i - y_i) / (1 - h_i c_i) to first order, with
-    leverage h_i = sum_m phi_im^2 v_m (its `OWN_SHARE`) and curvature c_i.
+    To first order, leaving out point i changes its log-odds by h_i (p_i - y_i) / (1 - h_i c_i), with
+    leverage h_i = `VARIANCE_FACTOR` * sum_m phi_im^2 v_m and curvature c_i.
 
     Args:
-        indices: (N, K) clusters that answer for each training point.
+        indices: (N, K) nearest clusters of each training point.
         values: (N, K) their kernel values.
-        log_odds: (N,) of the trained map at these points.
+        log_odds: (N,) log-odds of the trained map at these points.
         labels: (N,) 1 occupied, 0 free.
-        variances: (M,) of the weights.
+        variances: (M,) posterior variances of the weights.
 
     Returns:
-        (2,) free, occupied.
+        (2,) factors on free and on occupied log-odds.
     """
     some = slice(None, None, 1 + len(labels) // SCALE_POINTS)
     indices, values, log_odds, labels = (t[some] for t in (indices, values, log_odds, labels))
     residuals = torch.sigmoid(log_odds) - labels
-    leverage = OWN_SHARE * (values.square() * variances[indices]).sum(dim=1)
+    leverage = VARIANCE_FACTOR * (values.square() * variances[indices]).sum(dim=1)
     expected = (log_odds.square() + leverage).sqrt()
     damping = 1 - (leverage * logistic_curvature(expected)).clamp(max=MAX_LEVERAGE)
     left_out = log_odds + leverage * residuals / damping
-    variance = OWN_SHARE * latent_variance(indices, values, variances)
+    variance = VARIANCE_FACTOR * latent_variance(indices, values, variances)
     points = torch.stack([left_out, variance, labels, balance_classes(labels)])
     neutral, excess = torch.stack(
         [_scale_of_side(points[:, side]) for side in (left_out < 0, left_out >= 0)]
     ).T
-    free, both, free_itself = TRUST
+    free, both, free_itself = DAMPING_EXPONENTS
     powers = excess.new_tensor([[free_itself, both + free], [0.0, both]])
     return neutral * (excess.log() * powers).sum(dim=1).exp()
 
 
 def _scale_of_side(points: Tensor) -> Tensor:
-    """(2,) neutral factor, and how many times larger the best is; 1 and 1 without points.
+    """(2,) compensating factor, and ratio (at least 1) of the best factor to it; ones if no points.
 
     Args:
-        points: (4, S) left-out log-odds, their variance, labels and loss factors.
+        points: (4, S) leave-one-out log-odds, their variances, labels and loss factors.
     """
     left_out, variance, labels, factors = points
     if not len(labels):
@@ -172,7 +175,7 @@ def _scale_of_side(points: Tensor) -> Tensor:
 
 
 class Posterior(NamedTuple):
-    """What is known of a map's weights: (M,) means, (M,) variances, and (2,) `posterior_scales`."""
+    """Posterior of the weights: (M,) means, (M,) variances, and (2,) `posterior_scales`."""
 
     means: Tensor
     variances: Tensor
@@ -185,7 +188,7 @@ def fit_posterior(indices: Tensor, values: Tensor, weights: Tensor, labels: Tens
     Args:
         indices: (N, K) nearest clusters of each training point.
         values: (N, K) their kernel values.
-        weights: (M,) of the map.
+        weights: (M,) weights of the map.
         labels: (N,) 1 occupied, 0 free.
     """
     log_odds = (values * weights[indices]).sum(dim=1)
@@ -195,12 +198,12 @@ def fit_posterior(indices: Tensor, values: Tensor, weights: Tensor, labels: Tens
 
 
 def predict(features_of: FeaturesAt, points: Tensor, posterior: Posterior) -> tuple[Tensor, Tensor]:
-    """(N,) mean and (N,) variance of the log-odds at (N, D) points, some at a time.
+    """(N,) mean and (N,) variance of the log-odds at (N, D) points, computed in chunks.
 
     Args:
-        features_of: (B, D) points -> indices and kernel values (B, K).
+        features_of: function of (B, D) points that returns (B, K) indices and kernel values.
         points: (N, D) positions in the frame of ``features_of`` [m].
-        posterior: of the map's weights.
+        posterior: posterior of the weights.
     """
     parts = []
     for chunk in points.split(QUERY_CHUNK):

@@ -1,7 +1,7 @@
-"""Learning from a new scan without forgetting: the map recalls what it knows beside the new points.
+"""Incremental training without forgetting, by pseudo-samples that replace old scans.
 
-No old scan is kept. The moments of a cluster tell where its points were, the map itself what it
-held to be true there; points drawn from the moments, labelled by the map, stand for the old scans.
+No old scan is stored. Pseudo-samples are drawn from the moments of the clusters and labelled with the
+probability of the map. The weights are then trained on pseudo-samples and new points.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.assignment import explain, ordered_features, possibly_inside
+from lardhm_torch.learning.assignment import explain, inside_candidates, ordered_features
 from lardhm_torch.learning.clustering import MIN_COUNT, Columns, spread_rows
-from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
+from lardhm_torch.learning.fitting import FitConfig, class_factors, fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.points import in_morton_order
 
-INSIDE = 3.0  # standard deviations from an occupied cluster, within which free points contradict it
-KEPT = 0.25  # of a contradicted cluster's past
+INSIDE = 3.0  # Mahalanobis radius within which a point lies in an occupied cluster
+KEPT_FRACTION = 0.25  # fraction of the count that a contradicted cluster keeps
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence(Columns):
-    """What weights learn from: N points with a target each, and how much each counts.
+    """Weighted training points: N positions, targets, classes and sample weights.
 
-    ``labels`` are 0 to 1: a recalled point has the probability that the map gave it. ``is_occupied``
-    is the class a point stands for, so that both classes can be given the same total.
+    ``labels`` are in [0, 1]: the label of a pseudo-sample is the probability of the map. ``is_occupied``
+    is the class of a point, used to balance the classes. ``strength`` is the sample weight.
     """
 
     points: Tensor
@@ -42,9 +42,9 @@ class Evidence(Columns):
 
 
 def spread_points(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """(count, D) of the points, one from each of as many equal stretches; all if there are no more.
+    """(count, D) stratified random subset of the points; all points if there are at most ``count``.
 
-    Points of one ray follow each other, so that all rays get their share.
+    Points of a ray are consecutive, so the subset represents all rays equally.
     """
     if count >= len(points):
         return points
@@ -52,14 +52,15 @@ def spread_points(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
 
 
 def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> list[Evidence]:
-    """New points of each class, or ``limit`` of them that count for all, as many of each class.
+    """Training points of a scan: at most ``limit`` points, half of each class if possible.
 
-    Both classes have the same total in the loss, so that an equal number of each says most.
+    Points of a subset are weighted to represent all points of their class. Both classes have the same
+    total weight in the loss, so equal numbers of points are most efficient.
 
     Args:
         classes: (N, D) occupied and (N, D) free points [m].
-        limit: how many points at most.
-        rng: random state.
+        limit: maximum number of points.
+        rng: random generator.
     """
     parts = []
     for number, label in enumerate((1.0, 0.0)):
@@ -71,28 +72,28 @@ def new_evidence(classes: list[Tensor], limit: int, rng: torch.Generator) -> lis
     return parts
 
 
-def recalled_evidence(
+def replay_evidence(
     known: MapState, rows: Tensor, kernel: Kernel, strength: Tensor, rng: torch.Generator
 ) -> Evidence:
-    """Points drawn from the moments of clusters, labelled by the map that these clusters are.
+    """Pseudo-samples drawn from clusters, labelled with the probability of the map.
 
     Args:
-        known: all clusters nearby, as they were before the new scan.
-        rows: (Q,) which of them recall.
-        kernel: how the map turns them into probabilities.
-        strength: (Q, P) what each of P points of a cluster counts.
-        rng: random state.
+        known: all clusters near the scan, before the update.
+        rows: (Q,) clusters to draw from.
+        kernel: kernel settings of the map.
+        strength: (Q, P) sample weights of the P pseudo-samples of each cluster.
+        rng: random generator.
     """
-    recalling = known.rows(rows)
-    points = draw_points(recalling, strength.shape[1], kernel.min_lengthscale, rng)
+    sources = known.rows(rows)
+    points = draw_points(sources, strength.shape[1], kernel.min_lengthscale, rng)
     state = (known.centers, known.raw_scale_tril, known.weights, kernel)
     labels = native.occupancy(points, *state, probability=True)
-    is_occupied = recalling.is_occupied[:, None].expand_as(strength)
+    is_occupied = sources.is_occupied[:, None].expand_as(strength)
     return Evidence(points, labels, is_occupied.reshape(-1), strength.reshape(-1))
 
 
 def hit_clusters(known: MapState, hits: Tensor, floor: float) -> Tensor:
-    """(M,) bool: occupied clusters that (N, D) hits lie in."""
+    """(M,) bool mask of the occupied clusters that contain any of the (N, D) hits [m]."""
     found = torch.zeros_like(known.is_occupied)
     occupied = known.is_occupied.nonzero().squeeze(1)
     if len(occupied) == 0 or len(hits) == 0:
@@ -101,56 +102,57 @@ def hit_clusters(known: MapState, hits: Tensor, floor: float) -> Tensor:
 
 
 def _points_inside(known: MapState, points: Tensor, floor: float) -> Tensor:
-    """(M,) how many (N, D) points lie in each of M clusters, each point in its nearest at most."""
+    """(M,) number of (N, D) points inside each cluster; a point counts for its nearest one only."""
     return explain(points, known.clusters, floor, INSIDE, INSIDE)[1].counts
 
 
 def contradicted(
     known: MapState, hit: Tensor, num_hits: int, passed: Tensor, floor: float
 ) -> Tensor:
-    """(M,) how many points of an occupied cluster's past a scan leaves it; elsewhere infinity.
+    """(M,) upper bound on the weight of each cluster's old points; infinity if not contradicted.
 
-    A scan contradicts an occupied cluster if its rays pass through and none ends there. It is then
-    worth no more than the points that say so, however often it was seen before: old obstacles fade.
+    A scan contradicts an occupied cluster if rays pass through it and no ray ends in it. The bound is
+    the number of contradicting points, however often the cluster was observed before, so obstacles
+    that have been removed disappear from the map.
 
     Args:
         known: M clusters.
-        hit: (M,) which of them hits of the scan fell into.
-        num_hits: of the scan.
-        passed: (N, D) free points of the scan, or some of them that stand for all [m].
+        hit: (M,) bool, clusters that contain hits of the scan.
+        num_hits: number of hits of the scan.
+        passed: (N, D) free points of the scan, or a subset that represents them [m].
         floor: smallest standard deviation [m].
     """
-    worth = torch.full_like(known.weights, torch.inf)
+    bound = torch.full_like(known.weights, torch.inf)
     occupied = known.is_occupied.nonzero().squeeze(1)
     if len(occupied) == 0 or num_hits == 0 or len(passed) == 0:
-        return worth
-    share = num_hits / len(passed)  # in units of hits, as if both classes had one total
+        return bound
+    point_weight = num_hits / len(passed)  # weight of a free point that balances the classes
     unseen = known.rows(known.is_occupied & ~hit).clusters
-    passed = possibly_inside(passed, unseen, floor, INSIDE)
-    passes = share * _points_inside(known.rows(occupied), passed, floor).to(worth)
+    passed = inside_candidates(passed, unseen, floor, INSIDE)
+    passes = point_weight * _points_inside(known.rows(occupied), passed, floor).to(bound)
     denied = (passes > 0) & ~hit[occupied]
-    return worth.index_copy_(0, occupied, passes.where(denied, torch.inf))
+    return bound.index_copy_(0, occupied, passes.where(denied, torch.inf))
 
 
-def forget(part: MapState, worth: Tensor, memory: float) -> MapState:
-    """Clusters that a scan contradicts lose most of their past: what is kept is `KEPT` of it.
+def decay_evidence(part: MapState, bound: Tensor, memory: float) -> MapState:
+    """Evidence decay: reduce the counts of contradicted clusters to the fraction `KEPT_FRACTION`.
 
-    Their covariances stay, and their past counts as at most ``memory`` before it is cut. See
-    `contradicted` for what ``worth`` is: (Q,), of the first Q clusters.
+    Counts are capped at ``memory`` before they are reduced. Covariances do not change. ``bound`` is
+    the (Q,) result of `contradicted` for the first Q clusters.
     """
-    worth = torch.cat([worth, worth.new_full((len(part) - len(worth),), torch.inf)])
-    kept = (KEPT * part.counts.clamp(max=memory)).long().clamp(min=MIN_COUNT)
-    counts = torch.where(worth < kept, kept, part.counts).minimum(part.counts)
-    share = (counts - 1).clamp(min=1) / (part.counts - 1).clamp(min=1)
-    return replace(part, counts=counts, scatters=part.scatters * share.to(worth)[:, None, None])
+    bound = torch.cat([bound, bound.new_full((len(part) - len(bound),), torch.inf)])
+    kept = (KEPT_FRACTION * part.counts.clamp(max=memory)).long().clamp(min=MIN_COUNT)
+    counts = torch.where(bound < kept, kept, part.counts).minimum(part.counts)
+    fraction = (counts - 1).clamp(min=1) / (part.counts - 1).clamp(min=1)
+    return replace(part, counts=counts, scatters=part.scatters * fraction.to(bound)[:, None, None])
 
 
 def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator) -> Tensor:
-    """(M * count, D) points uniform in ellipsoids with the clusters' means and covariances.
+    """(M * count, D) points, uniform in ellipsoids with the means and covariances of the clusters.
 
-    Cells of k-means end where the next begins; a normal distribution would reach far into it. Points
-    come in pairs on opposite sides of the mean and at radii spread evenly: a few stand for a cluster
-    better than as many independent ones.
+    Cells of k-means do not overlap, whereas samples of a normal distribution would lie in adjacent
+    cells too. To reduce the variance, points are drawn in antithetic pairs about the mean, with
+    stratified radii.
     """
     clusters = known.clusters
     spread = clusters.scatters / clusters.counts.clamp(min=1)[:, None, None]
@@ -160,18 +162,18 @@ def draw_points(known: MapState, count: int, floor: float, rng: torch.Generator)
     shape = (num_clusters, pairs, dim)
     direction = torch.randn(shape, generator=rng, device=rng.device, dtype=factors.dtype)
     direction /= torch.linalg.vector_norm(direction, dim=2, keepdim=True)
-    share = torch.rand(num_clusters, pairs, 1, generator=rng, device=rng.device).to(factors)
-    share = (share + torch.arange(pairs, device=rng.device)[:, None]) / pairs
-    ball = (dim + 2) ** 0.5 * share ** (1 / dim) * direction
+    volume = torch.rand(num_clusters, pairs, 1, generator=rng, device=rng.device).to(factors)
+    volume = (volume + torch.arange(pairs, device=rng.device)[:, None]) / pairs
+    ball = (dim + 2) ** 0.5 * volume ** (1 / dim) * direction
     ball = torch.cat([ball, -ball], dim=1)[:, :count]
     return (clusters.means[:, None] + ball @ factors.mT).reshape(-1, dim)
 
 
-def around(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
-    """(M,) bool: clusters that new points joined or made, their neighbors, and the next ones.
+def neighborhood(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
+    """(M,) bool mask of changed clusters, their neighbors, and the neighbors of those.
 
-    The weights of the neighbors, too, are pulled by the new points; what the next ones know must
-    hold them.
+    New points also affect the weights of the neighbors, so pseudo-samples of the second neighbors are
+    needed to constrain them.
     """
 
     def neighbors(mask: Tensor) -> Tensor:
@@ -183,7 +185,7 @@ def around(changed: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) 
 
 
 def join_evidence(parts: list[Evidence]) -> Evidence:
-    """All points of several, in order."""
+    """Concatenate evidence, in order."""
     return Evidence(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -195,23 +197,23 @@ def learn(
     config: FitConfig,
     rng: torch.Generator,
 ) -> Tensor:
-    """(M,) weights trained on the evidence from a start; the classes share the loss as in `fit`.
+    """(M,) weights trained on the evidence; classes are balanced as in `fit`.
 
-    The regularizer is spread over all that the evidence stands for, not over the few points that
-    carry it: otherwise every scan would pull the weights further to zero.
+    The regularizer is divided by the total sample weight, not by the number of points. Otherwise,
+    every scan would shrink the weights further toward 0.
 
     Args:
-        state: M clusters and the weights to start from.
-        evidence: N points.
-        kernel: of the map.
-        index: of the centers, see `native.build_index`.
+        state: M clusters with initial weights.
+        evidence: N weighted points.
+        kernel: kernel settings of the map.
+        index: search index of the centers, see `native.build_index`.
         config: passes, rates and regularizer.
-        rng: random state.
+        rng: random generator.
     """
-    batch_size = config.rows_a_batch(len(evidence))
+    batch_size = config.rows_per_batch(len(evidence))
     points, *columns = in_morton_order(*evidence)
     rows = torch.arange(len(points), device=points.device)
-    order, labels, is_occupied, strength = deal_samples((rows, *columns), batch_size, rng)
+    order, labels, is_occupied, strength = stratified_batches((rows, *columns), batch_size, rng)
     indices, values = ordered_features(
         points, order, state.centers, state.raw_scale_tril, kernel, index
     )

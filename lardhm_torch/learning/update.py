@@ -1,9 +1,9 @@
-"""One more scan into a map: Algorithm 2, and a default under which the map stops growing.
+"""Incremental update with one more scan: Algorithm 2, and a default rule with bounded growth.
 
-Algorithm 2 clusters the new points and merges new clusters with old ones. Two partitions of one
-surface rarely put their centers within one standard deviation of each other, so a map grows with
-every visit. By default new points therefore go straight into the clusters of their class that
-explain them, and only the others are clustered.
+Algorithm 2 clusters the new points and merges new clusters with old ones. Two independent partitions
+of a surface rarely have centers within one standard deviation of each other, so the map grows with
+every scan of the same place. By default, new points are therefore assigned directly to nearby clusters
+of their class, and only the remaining points are clustered.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.assignment import explain, reaching, unexplained
+from lardhm_torch.learning.assignment import explain, kernels_near, unexplained
 from lardhm_torch.learning.cluster_matching import (
     append_clusters,
     merge_clusters,
@@ -36,40 +36,40 @@ from lardhm_torch.learning.clustering import (
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.replay import (
-    around,
     contradicted,
-    forget,
+    decay_evidence,
     hit_clusters,
     join_evidence,
     learn,
+    neighborhood,
     new_evidence,
-    recalled_evidence,
+    replay_evidence,
     spread_points,
 )
 from lardhm_torch.points import in_morton_order
 
-COVERED = 0.36  # of a cluster's variance: new points that spread over so much have seen all of it
-SMOOTHER = 2.0  # free space than surfaces: so many times the points before a cluster is too coarse
-REACH = 2.0  # standard deviations of its kernel that a cluster near a scan reaches
-LOOKED_AT = 4  # times as many points may contradict old clusters as train the weights
-# The map recalls its own leaning to hits, so that new points need no more of it.
+COVERED_FRACTION = 0.36  # a scan covers a cluster if its points have this fraction of the variance
+FREE_FACTOR = 2.0  # factor on `UpdateConfig.crowded` for free clusters, which may be coarser
+BOX_STDS = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
+CHECKED_POINTS = 4  # number of free points checked for contradictions, relative to max_points
+# Pseudo-samples already contain the class weight of `fit`, so the classes get equal weights here.
 UPDATE_FIT = FitConfig(batch_size=1024, l2=0.01, occupied_share=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateConfig:
-    """How a new scan enters a map. Radii are in standard deviations of a cluster."""
+    """Settings of an incremental update. Radii are in standard deviations of a cluster."""
 
-    as_in_paper: bool = False  # cluster all new points and merge by Algorithm 2
-    zeta: float = 1.0  # [m] of Algorithm 2: clusters farther apart never merge
-    radius: float = 3.0  # a point this near to the nearest center of its class joins the cluster
-    reach: float = 4.0  # nearer points make no new cluster
-    fringe: float = 2.0  # a new cluster with an old center this near to its own is not taken
-    refine: float = 1.3  # a scan with so many times the points of a cluster makes finer ones of it
-    crowded: float = 8.0  # in that, a past counts at most so many times the usual points
-    max_points: int = 20_000  # that train the weights, at random; all points enter the clusters
-    replay: int = 8  # points recalled from an old cluster; 0: train on new points only
-    memory: float = 800.0  # a cluster's past counts at most as many points: the world may change
+    as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
+    zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
+    radius: float = 3.0  # points within it of the nearest center of their class join the cluster
+    reach: float = 4.0  # only points beyond it form new clusters
+    fringe: float = 2.0  # new clusters with an old center within it are discarded
+    refine: float = 1.3  # clusters whose ratio of new to old points exceeds this are split
+    crowded: float = 8.0  # for that rule, the old count is capped at this times the usual count
+    max_points: int = 20_000  # random points used to train the weights; clusters use all points
+    replay: int = 8  # pseudo-samples per old cluster; 0: train on new points only
+    memory: float = 800.0  # upper bound on the weight of the old points of a cluster
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
@@ -93,7 +93,7 @@ class UpdateConfig:
 
 
 class Task(NamedTuple):
-    """What every step of an update needs beside clusters and points."""
+    """Settings and random generator of an update."""
 
     kernel: Kernel
     config: UpdateConfig
@@ -103,25 +103,26 @@ class Task(NamedTuple):
 def updated(
     state: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
 ) -> tuple[Tensor, MapState]:
-    """One more scan: clusters pooled or appended, weights trained.
+    """Update clusters and weights with one more scan.
 
-    Only clusters near the points are read, so that the cost does not grow with the map. Old
-    clusters keep their rows; new ones come after them.
+    Only clusters near the points are processed, so the cost does not grow with the map. Existing
+    clusters keep their rows, and new clusters are appended.
 
     Args:
         state: M clusters.
         points: (N, D) new positions, map frame [m].
         labels: (N,) 1 occupied, 0 free.
-        num_clusters: total over both classes if no point were explained yet; None: from the data.
-        task: kernel, settings, random state.
+        num_clusters: total over both classes for a scan of an unmapped place; None: chosen from the
+            data.
+        task: kernel, settings, random generator.
 
     Returns:
-        ((Q,) rows of the clusters near the points; what becomes of them, in that order, and after
-        them the new clusters).
+        (Q,) rows of the clusters near the points; and the updated clusters in that order, followed
+        by the new clusters.
 
     Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
     """
-    near = reaching(state.centers, state.raw_scale_tril, task.kernel, points, REACH)
+    near = kernels_near(state.centers, state.raw_scale_tril, task.kernel, points, BOX_STDS)
     nearby = near.nonzero().squeeze(1)
     known = state.rows(nearby)
     classes = split_classes(points, labels > 0.5)
@@ -140,7 +141,7 @@ def updated(
 def _grown(
     known: MapState, classes: list[Tensor], num_clusters: int | None, task: Task
 ) -> tuple[MapState, Tensor]:
-    """(Known clusters with the new points pooled into them, and new ones; which known ones were hit)."""
+    """Known clusters pooled with new points, followed by new clusters; and a mask of those hit."""
     if num_clusters is None:
         totals = scan_clusters(classes)
     else:
@@ -148,22 +149,22 @@ def _grown(
     part, hit = known, torch.zeros_like(known.is_occupied)
     for kind, members, total in zip((True, False), classes, totals, strict=True):
         if total:
-            part, met = absorb(part, members, kind, total, task)
-            hit = hit.index_fill(0, met, True) if kind else hit
+            part, joined = absorb(part, members, kind, total, task)
+            hit = hit.index_fill(0, joined, True) if kind else hit
     return part, hit
 
 
 def _train(
     part: MapState, known: MapState, classes: list[Tensor], hit: Tensor, task: Task
 ) -> MapState:
-    """Weights trained on the new points and on what the clusters around them recall.
+    """Train the weights on the new points and on pseudo-samples of nearby clusters.
 
     Args:
-        part: what the clusters nearby become, new ones at the end.
-        known: what they were.
-        classes: occupied and free new points [m].
-        hit: (Q,) which known clusters hits fell into.
-        task: kernel, settings, random state.
+        part: updated clusters near the scan, followed by new ones.
+        known: Q clusters near the scan, before the update.
+        classes: (N, D) occupied and (F, D) free new points [m].
+        hit: (Q,) bool, known clusters that contain new hits.
+        task: kernel, settings, random generator.
     """
     config, kernel, rng = task.config, task.kernel, task.rng
     index = native.build_index(part.centers, kernel.num_neighbors)
@@ -173,93 +174,98 @@ def _train(
         return replace(part, weights=learned)
     changed = torch.ones_like(part.is_occupied)
     changed[: len(known)] = (part.means[: len(known)] != known.means).any(dim=1)
-    moving = around(changed, part.centers, kernel.num_neighbors, index)
+    moving = neighborhood(changed, part.centers, kernel.num_neighbors, index)
     rows = moving[: len(known)].nonzero().squeeze(1)
-    looked_at = LOOKED_AT * config.max_points
-    passed = spread_points(classes[1], looked_at, rng)
-    worth = contradicted(known, hit, len(classes[0]), passed, kernel.min_lengthscale)
-    strength = known.counts.clamp(max=config.memory).to(worth).minimum(worth)[rows]
+    num_checked = CHECKED_POINTS * config.max_points
+    passed = spread_points(classes[1], num_checked, rng)
+    bound = contradicted(known, hit, len(classes[0]), passed, kernel.min_lengthscale)
+    strength = known.counts.clamp(max=config.memory).to(bound).minimum(bound)[rows]
     strength = (strength / config.replay)[:, None].expand(-1, config.replay)
-    old = recalled_evidence(known, rows, kernel, strength, rng)
+    old = replay_evidence(known, rows, kernel, strength, rng)
     learned = learn(part, join_evidence([*new, old]), kernel, index, config.fit, rng)
     return replace(
-        forget(part, worth, config.memory), weights=torch.where(moving, learned, part.weights)
+        decay_evidence(part, bound, config.memory),
+        weights=torch.where(moving, learned, part.weights),
     )
 
 
 def absorb(
     part: MapState, points: Tensor, is_occupied: bool, num_clusters: int, task: Task
 ) -> tuple[MapState, Tensor]:
-    """Points of one class pooled into the clusters that explain them; the others make new ones.
+    """Assign points of one class to nearby clusters; cluster the remaining points.
 
     Args:
-        part: clusters nearby, of both classes.
+        part: clusters near the scan, of both classes.
         points: (N, D) new points of one class [m].
-        is_occupied: which class.
-        num_clusters: how many all the points would make; the unexplained make their share.
-        task: kernel, settings, random state.
+        is_occupied: class of the points.
+        num_clusters: number of clusters for all points; reduced in proportion to the points that
+            remain.
+        task: kernel, settings, random generator.
 
     Returns:
-        (what becomes of ``part``, new clusters at its end; rows of those that points fell into).
+        Updated clusters ``part``, followed by new ones; and the rows of clusters that contain new
+        points.
     """
     floor = task.kernel.min_lengthscale
     own = (part.is_occupied == is_occupied).nonzero().squeeze(1)
     known = part.rows(own)
-    look = _explain(known, points, len(points) / num_clusters, task)
-    pooled = (look.found.counts > 0).nonzero().squeeze(1)
-    part = pool_into(part, own[pooled], take_clusters(look.found, pooled), floor)
-    met = torch.cat([own[pooled], own[look.outgrown]])
-    if len(look.rest) < MIN_COUNT:
-        return part, met
-    (rest,) = in_morton_order(look.rest)
-    share = -(-num_clusters * len(rest) // len(points))
-    new = cluster_points(rest, share, task.rng)
-    new, where = _settle(known, new, look, task)
+    assignment = _assign(known, points, len(points) / num_clusters, task)
+    pooled = (assignment.found.counts > 0).nonzero().squeeze(1)
+    part = pool_into(part, own[pooled], take_clusters(assignment.found, pooled), floor)
+    joined = torch.cat([own[pooled], own[assignment.too_coarse]])
+    if len(assignment.rest) < MIN_COUNT:
+        return part, joined
+    (rest,) = in_morton_order(assignment.rest)
+    num_new = -(-num_clusters * len(rest) // len(points))
+    new = cluster_points(rest, num_new, task.rng)
+    new, where = _select_new(known, new, assignment, task)
     kinds = torch.full((len(new),), is_occupied, device=points.device)
-    return append_clusters(part, new, kinds, floor, own[where]), met
+    return append_clusters(part, new, kinds, floor, own[where]), joined
 
 
-class _Look(NamedTuple):
-    """What known clusters make of new points.
+class _Assignment(NamedTuple):
+    """Assignment of new points to known clusters.
 
-    ``found`` are the moments of the points that join each cluster; ``outgrown`` are the clusters
-    that are too coarse for the scan, and ``covered`` those among them that the scan saw whole;
-    ``rest`` are the points of the outgrown clusters, and those that no cluster explains.
+    ``found`` holds the moments of the points that join each cluster. ``too_coarse`` masks the clusters
+    that are too coarse for the scan, and ``covered`` those of them that the scan covers completely.
+    ``rest`` holds the points of too coarse clusters, and the points without a nearby cluster.
     """
 
     rest: Tensor
     found: Clusters
-    outgrown: Tensor
+    too_coarse: Tensor
     covered: Tensor
 
 
-def _explain(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Look:
+def _assign(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Assignment:
     config, clusters = task.config, known.clusters
     if len(known) == 0:
-        return _Look(points, clusters, known.is_occupied, known.is_occupied)
+        return _Assignment(points, clusters, known.is_occupied, known.is_occupied)
     rule = (task.kernel.min_lengthscale, config.radius, config.reach)
     owners, found = explain(points, clusters, *rule)
-    # many scans that each see a little more of a cluster must not hide that it has become too coarse
-    most = config.crowded if bool(known.is_occupied[0]) else SMOOTHER * config.crowded
+    # Cap the count, so that a cluster that grew over many scans can still be found to be too coarse.
+    most = config.crowded if bool(known.is_occupied[0]) else FREE_FACTOR * config.crowded
     past = clusters.counts.clamp(2 * usual_count, most * usual_count)
-    outgrown = found.counts > config.refine * past
-    covered = outgrown & (_spread(found) > COVERED * _spread(clusters))
-    found = Clusters(found.counts * ~outgrown, found.means, found.scatters)
-    return _Look(unexplained(points, owners, ~outgrown), found, outgrown, covered)
+    too_coarse = found.counts > config.refine * past
+    covered = too_coarse & (_spread(found) > COVERED_FRACTION * _spread(clusters))
+    found = Clusters(found.counts * ~too_coarse, found.means, found.scatters)
+    return _Assignment(unexplained(points, owners, ~too_coarse), found, too_coarse, covered)
 
 
 def _spread(clusters: Clusters) -> Tensor:
-    """(M,) total variance [m^2]."""
+    """(M,) total variance of each cluster [m^2]."""
     total = clusters.scatters.diagonal(dim1=1, dim2=2).sum(dim=1)
     return total / clusters.counts.clamp(min=1)
 
 
-def _settle(known: MapState, new: Clusters, look: _Look, task: Task) -> tuple[Clusters, Tensor]:
-    """Which new clusters are taken, in which order, and the rows that the first of them take over.
+def _select_new(
+    known: MapState, new: Clusters, assignment: _Assignment, task: Task
+) -> tuple[Clusters, Tensor]:
+    """Select and order the new clusters, and return the rows that the first of them replace.
 
-    A new cluster that has an old center among its own points is the fringe of old ones and is left
-    out. The new clusters of a covered one share its points in proportion to their own, and one of
-    them takes over its row.
+    A new cluster close to an old center lies at the boundary of an old cluster and is discarded. The
+    count of a covered cluster is distributed among its new clusters in proportion to their counts,
+    and one of them replaces its row.
     """
     none = known.counts[:0]
     if len(known) == 0:
@@ -267,15 +273,15 @@ def _settle(known: MapState, new: Clusters, look: _Look, task: Task) -> tuple[Cl
     owner = native.nearest_centers(new.means, known.means, 1).squeeze(1)
     offsets = known.means[owner] - new.means
     apart = whitened(offsets, new.covariances, task.kernel.min_lengthscale) > task.config.fringe
-    kept = look.outgrown[owner] | apart
+    kept = assignment.too_coarse[owner] | apart
     new, owner = take_clusters(new, kept), owner[kept]
-    heirs = look.covered[owner]
+    inherits = assignment.covered[owner]
     total = torch.zeros_like(known.counts).index_add_(0, owner, new.counts)
-    gain = torch.where(heirs, 1 + known.counts[owner] / total[owner], 1.0).to(new.means.dtype)
+    gain = torch.where(inherits, 1 + known.counts[owner] / total[owner], 1.0).to(new.means.dtype)
     order = torch.arange(len(new), device=owner.device)
     first = torch.full_like(known.counts, len(new)).scatter_reduce(0, owner, order, "amin")
-    where = (look.covered & (first < len(new))).nonzero().squeeze(1)
-    rest = torch.ones_like(heirs).index_fill_(0, first[where], False).nonzero().squeeze(1)
+    where = (assignment.covered & (first < len(new))).nonzero().squeeze(1)
+    rest = torch.ones_like(inherits).index_fill_(0, first[where], False).nonzero().squeeze(1)
     order = torch.cat([first[where], rest])
     scatters = new.scatters * gain[:, None, None]
     return take_clusters(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.learning.parameters import OF_THE_WHOLE
+from lardhm_torch.learning.parameters import PER_MAP
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.indexing import Folder, tile_indices, tile_path
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest
@@ -49,7 +49,7 @@ def _select_clusters(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
     """A map of some of the clusters of another, in the same frame."""
     result = LardHilbertMap(**model.settings).to(model.centers)
     tensors = {
-        name: tensor[rows] if isinstance(tensor, Tensor) and name not in OF_THE_WHOLE else tensor
+        name: tensor[rows] if isinstance(tensor, Tensor) and name not in PER_MAP else tensor
         for name, tensor in model.state_dict().items()
     }
     result.load_state_dict(tensors)
@@ -93,7 +93,7 @@ def join_states(
 
 def _in_frame(state: TileState, origin: Tensor) -> TileState:
     """The tensors with a row for each cluster, with positions relative to another origin."""
-    tensors = {name: tensor for name, tensor in state.items() if name not in OF_THE_WHOLE}
+    tensors = {name: tensor for name, tensor in state.items() if name not in PER_MAP}
     if not torch.equal(state["origin"], origin):
         for name in ("centers", "means"):
             shift = state["origin"] - origin

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.map_files import check_settings, decode_safetensors
-from lardhm_torch.learning.parameters import OF_THE_WHOLE
+from lardhm_torch.learning.parameters import PER_MAP
 from lardhm_torch.tiles.entries import Tile
 from lardhm_torch.tiles.indexing import Folder, Index, tile_name, tile_path
 from lardhm_torch.tiles.manifest import Manifest
@@ -111,7 +111,7 @@ class TileStore:
             if found.get(name) != value:
                 raise ValueError(f"{name} must be {value}; {path} has {found.get(name)}")
         for name, empty in self._empty.items():
-            rows = empty.shape if name in OF_THE_WHOLE else (entry.num_clusters, *empty.shape[1:])
+            rows = empty.shape if name in PER_MAP else (entry.num_clusters, *empty.shape[1:])
             if state[name].shape != rows or state[name].dtype != empty.dtype:
                 raise ValueError(
                     f"{name} must be {tuple(rows)} of dtype {empty.dtype}; "

@@ -29,7 +29,7 @@ from lardhm_torch.learning.clustering import (
     cluster_each,
     concatenate_clusters,
 )
-from lardhm_torch.learning.fitting import FitConfig, class_factors, deal_samples, fit_weights
+from lardhm_torch.learning.fitting import FitConfig, class_factors, fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.points import in_morton_order
 from lardhm_torch.tiles.indexing import Index
@@ -132,10 +132,10 @@ def train_tile(
     raw = raw_factors(factor_covariances(clusters.covariances, task.kernel.min_lengthscale))
     rows = max(LEAST_BATCH, len(tile.points) // 128)
     config = replace(task.config, batch_size=task.config.batch_size or rows)
-    size = config.rows_a_batch(len(tile.points))
+    size = config.rows_per_batch(len(tile.points))
     points, kind = in_morton_order(*tile)
     order = torch.arange(len(kind), device=kind.device)
-    order, kind = deal_samples((order, kind), size, task.rng)
+    order, kind = stratified_batches((order, kind), size, task.rng)
     index = native.build_index(clusters.means, task.kernel.num_neighbors)
 
     def features_of(part: slice) -> tuple[Tensor, Tensor]:

@@ -25,8 +25,8 @@ from lardhm_torch.evaluation.baselines.local_gp import LocalGP
 from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline, to_array
 from lardhm_torch.evaluation.baselines.original_hilbert_map import OriginalHilbertMap
 from lardhm_torch.features import raw_factors
-from lardhm_torch.learning.clustering import clusters_about, mini_batch_kmeans
-from lardhm_torch.learning.fitting import deal_samples, fit_weights
+from lardhm_torch.learning.clustering import clusters_from_moments, mini_batch_kmeans
+from lardhm_torch.learning.fitting import fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.points import in_morton_order
 
@@ -94,7 +94,7 @@ def _stages(local: Tensor, labels: Tensor, grid: Tensor, seed: int) -> dict[str,
         means = timed("clustering", lambda m=members, c=count: mini_batch_kmeans(m, c, rng))
 
         def moments(members: Tensor = members, means: Tensor = means) -> tuple[Tensor, Tensor]:
-            clusters = clusters_about(means, *native.assign(members, means)[1:])
+            clusters = clusters_from_moments(means, *native.assign(members, means)[1:])
             factors = factor_covariances(clusters.covariances, kernel.min_lengthscale)
             return clusters.means, raw_factors(factors)
 
@@ -105,7 +105,7 @@ def _stages(local: Tensor, labels: Tensor, grid: Tensor, seed: int) -> dict[str,
         index = native.build_index(centers, NUM_NEIGHBORS)
         return native.nearest_features(points, centers, factors, kernel, index)
 
-    local, labels = deal_samples((local, labels), FitConfig().rows_a_batch(len(local)), rng)
+    local, labels = stratified_batches((local, labels), FitConfig().rows_per_batch(len(local)), rng)
     indices, values = timed("training features", lambda: features(local))
 
     def trained(config: FitConfig) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch.learning.fitting import FitConfig, deal_samples, fit_weights
+from lardhm_torch.learning.fitting import FitConfig, fit_weights, stratified_batches
 from lardhm_torch.points import check_samples, in_morton_order
 
 SUPPORT_RADIUS = 2.5  # [cells] kernels are truncated here, at exp(-2.5^2 / 2) = 4 % of the peak
@@ -76,7 +76,7 @@ class OriginalHilbertMap:
         rng = torch.Generator(device=points.device).manual_seed(self.seed)
 
         samples = in_morton_order(points, labels.to(self.dtype))
-        points, labels = deal_samples(samples, self.config.rows_a_batch(len(points)), rng)
+        points, labels = stratified_batches(samples, self.config.rows_per_batch(len(points)), rng)
 
         def features_of(rows: slice) -> tuple[Tensor, Tensor]:
             return self.features(points[rows])
