@@ -6,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_maps import F64, same_map, wall, wall_map
 
-from lardhm_torch import LardHilbertMap, load_scans, merge_maps, sample_rays, split_rays
+from lardhm_torch import (
+    LardHilbertMap,
+    load_scans,
+    merge_maps,
+    sample_rays,
+    simulate_room,
+    split_rays,
+)
 
 
 def rotation(dim, seed):
@@ -205,3 +212,17 @@ def test_the_maps_of_two_robots_make_one_that_is_as_good_as_all_scans_at_once(da
     for kind, loss in (("unif", 0.01), ("near", 0.02)):
         ours = evaluate(joined, test)[kind]["balanced_accuracy"]
         assert ours >= evaluate(batch, test)[kind]["balanced_accuracy"] - loss
+
+
+def test_clusters_of_unknown_points_merge_without_nan():
+    maps = []
+    for seed in (1, 2):
+        samples = sample_rays(simulate_room(1500, seed=seed), seed=seed)
+        maps.append(LardHilbertMap().fit(samples.points, samples.labels))
+    assert all(bool((model.counts == 0).any()) for model in maps)
+    merged = merge_maps(*maps)
+    for name, tensor in merged.state_dict().items():
+        assert not isinstance(tensor, torch.Tensor) or bool(tensor.isfinite().all()), name
+    twice = merge_maps(maps[0], maps[0])
+    points = samples.points[::20]
+    assert (twice(points) - maps[0](points)).abs().max() < 0.05

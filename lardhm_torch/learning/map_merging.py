@@ -154,13 +154,15 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
     """Merge matching clusters, and append the other clusters of the second map.
 
     Factors are changed by the change of the biased covariances (scatter / count), because merging two
-    equal clusters does not change the biased covariance.
+    equal clusters does not change the biased covariance. A cluster of unknown points (count 0) of the
+    second map is dropped where it matches: it adds nothing to what is there.
     """
     floor = kernel.min_lengthscale
     match = match_clusters(ours, theirs.clusters, theirs.is_occupied, ZETA, floor)
-    matched = match >= 0
-    where, groups = match[matched].unique(return_inverse=True)
-    before, others = ours.rows(where), theirs.rows(matched)
+    is_matched = match >= 0
+    merged = is_matched & (theirs.counts > 0)
+    where, groups = match[merged].unique(return_inverse=True)
+    before, others = ours.rows(where), theirs.rows(merged)
     rows = torch.cat([torch.arange(len(where), device=groups.device), groups])
     clusters = concatenate_clusters([before.clusters, others.clusters])
     pooled = pool_clusters(clusters, rows, len(where))
@@ -184,7 +186,7 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
         pooled.means,
         pooled.scatters,
     )
-    rest = theirs.rows(~matched)
+    rest = theirs.rows(~is_matched)
     tail = MapState(*(torch.cat(pair) for pair in zip(after, rest, strict=True)))
     return ours.put(where, tail)
 
