@@ -207,3 +207,19 @@ def test_what_cannot_be_tuned_is_refused():
 def test_settings_are_checked_when_made(settings, message):
     with pytest.raises(ValueError, match=message):
         TuneConfig(**settings)
+
+
+def test_unknown_points_do_not_train():
+    model, points, labels = fitted(num_clusters=8, config=FitConfig(passes=4))
+    other, rays = copy.deepcopy(model), torch.arange(len(points))
+    fine_tune(model, points, labels, ray_id=rays)
+    more = torch.cat([points, points[:50] + 0.3])
+    fine_tune(
+        other,
+        more,
+        torch.cat([labels, torch.full((50,), 0.5)]),
+        ray_id=torch.cat([rays, rays[:50]]),
+    )
+    assert torch.equal(model.weights, other.weights)
+    with pytest.raises(ValueError, match="all are 1/2"):
+        fine_tune(model, points, torch.full_like(labels, 0.5))

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lardhm_torch.cli.outputs import check_output
 from lardhm_torch.cli.scan_files import describe_scans, read_scans
+
+if TYPE_CHECKING:
+    from lardhm_torch import LardHilbertMap, TiledMap
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
@@ -173,7 +176,7 @@ def info(arguments: argparse.Namespace) -> None:
         print(f"{name:<22}{value}")
 
 
-def _check_resolution(model: Any, resolution: float) -> None:
+def _check_resolution(model: LardHilbertMap | TiledMap, resolution: float) -> None:
     """Raise a ValueError for a cell size that is not positive or would fill the memory."""
     from lardhm_torch.queries.grids import map_bounds
 

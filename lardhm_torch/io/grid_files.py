@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.evaluation.baselines.octomap import new_tree, to_array
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.io.octrees import new_tree, to_array
 from lardhm_torch.maps import OccupancyMap, TensorLike
 from lardhm_torch.queries.grids import (
     BLOCK_POINTS,

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from lardhm_torch import native
 from lardhm_torch.learning.fitting import balance_classes, label_factors, logistic_loss
 from lardhm_torch.learning.parameters import MapParameters
-from lardhm_torch.points import check_samples, to_map_frame
+from lardhm_torch.points import UNKNOWN, check_samples, to_map_frame
 from lardhm_torch.sampling import Samples, seeded_generator
 
 WARM_UP_STEPS = 20  # number of steps of the learning rate warm-up
@@ -49,7 +49,7 @@ def fine_tune(
     Args:
         model: a fitted map, changed in place.
         points: (N, D) world positions [m].
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+        labels: (N,) 1 occupied, 0 free; unknown points (1/2) are left out.
         ray_id: (N,) ray of each point, so that complete rays are held out (`Samples.ray_id`);
             None: points are held out individually.
         resample: function that returns new samples of the same rays, given the number of the epoch
@@ -106,6 +106,11 @@ def fine_tune(
 def _check(
     model: MapParameters, points: Tensor, labels: Tensor, ray_id: Tensor | None
 ) -> LabelledPoints:
+    """The occupied and free samples, checked.
+
+    Unknown points are left out: `fit` has made the map say 1/2 there, and tuning on them costs
+    log-loss on held-out rays.
+    """
     points, labels = check_samples(
         points, labels, model.dim, model.origin.device, keep_unknown=True
     )
@@ -115,7 +120,12 @@ def _check(
             raise ValueError(
                 f"ray_id must be ({len(labels)},), one per point; got {tuple(ray_id.shape)}"
             )
-    return LabelledPoints(points, labels, ray_id)
+    known = labels != UNKNOWN
+    if bool(known.all()):
+        return LabelledPoints(points, labels, ray_id)
+    if not bool(known.any()):
+        raise ValueError("labels must hold 0 or 1; all are 1/2 (unknown)")
+    return LabelledPoints(points[known], labels[known], None if ray_id is None else ray_id[known])
 
 
 def _hold_out(samples: LabelledPoints, fraction: float, rng: torch.Generator) -> Tensor | None:

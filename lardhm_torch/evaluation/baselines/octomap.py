@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.io.octrees import new_tree, to_array
 from lardhm_torch.scans import Scans
 
 UNKNOWN = -1  # label of unobserved voxels in getLabels
@@ -77,20 +78,3 @@ class OctoMapBaseline:
         return torch.from_numpy(probability).to(points.device)
 
     __call__ = probability
-
-
-def new_tree(resolution: float) -> Any:
-    """An empty octree of octomap-python; an ImportError without it names the extra to install."""
-    try:
-        import octomap
-    except ImportError as error:
-        raise ImportError(
-            "OctoMap trees need octomap-python, which is not installed; "
-            'install the extra: pip install "lardhm_torch[octomap]"'
-        ) from error
-    return octomap.OcTree(resolution)
-
-
-def to_array(tensor: Tensor) -> np.ndarray:
-    """Contiguous float64 array, as octomap-python needs it."""
-    return np.ascontiguousarray(tensor, dtype=np.float64)
