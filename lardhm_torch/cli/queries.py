@@ -11,6 +11,8 @@ from lardhm_torch.cli.outputs import check_output
 from lardhm_torch.cli.scan_files import describe_scans, read_scans
 
 if TYPE_CHECKING:
+    import trimesh
+
     from lardhm_torch import LardHilbertMap, TiledMap
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
@@ -41,21 +43,13 @@ def query(arguments: argparse.Namespace) -> None:
 
 def mesh(arguments: argparse.Namespace) -> None:
     """Extract the surface of a map as a mesh."""
-    from lardhm_torch import extract_mesh
     from lardhm_torch.io.mesh_files import MESH_SUFFIXES, save_mesh
     from lardhm_torch.tiles.tiled_map import open_map
 
     check_output(arguments.output, MESH_SUFFIXES, [arguments.map])
     model = open_map(arguments.map)
     _check_resolution(model, arguments.resolution)
-    surface = extract_mesh(
-        model,
-        arguments.resolution,
-        arguments.threshold,
-        surface=arguments.surface,
-        color=arguments.color,
-        progress=True,
-    )
+    surface = _surface(model, arguments)
     save_mesh(surface, arguments.output)
     print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
 
@@ -118,7 +112,6 @@ def _check_address(host: str, port: int) -> None:
 
 def render(arguments: argparse.Namespace) -> None:
     """Draw a map to a picture; no display is needed."""
-    from lardhm_torch import extract_mesh
     from lardhm_torch.tiles.tiled_map import open_map
     from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
@@ -129,14 +122,7 @@ def render(arguments: argparse.Namespace) -> None:
         render_slice(model, arguments.output, arguments.slice, arguments.resolution)
         print(f"slice -> {arguments.output}")
         return
-    surface = extract_mesh(
-        model,
-        arguments.resolution,
-        arguments.threshold,
-        surface=arguments.surface,
-        color=arguments.color,
-        progress=True,
-    )
+    surface = _surface(model, arguments)
     angles = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
     render_mesh(surface, arguments.output, cut_above=arguments.cut_above, **angles)
     print(f"{len(surface.faces)} faces -> {arguments.output}")
@@ -174,6 +160,19 @@ def info(arguments: argparse.Namespace) -> None:
         return
     for name, value in rows.items():
         print(f"{name:<22}{value}")
+
+
+def _surface(model: LardHilbertMap | TiledMap, arguments: argparse.Namespace) -> trimesh.Trimesh:
+    from lardhm_torch import extract_mesh
+
+    return extract_mesh(
+        model,
+        arguments.resolution,
+        arguments.threshold,
+        surface=arguments.surface,
+        color=arguments.color,
+        progress=True,
+    )
 
 
 def _check_resolution(model: LardHilbertMap | TiledMap, resolution: float) -> None:

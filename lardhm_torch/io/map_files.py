@@ -129,7 +129,7 @@ def _is_safetensors(path: str | os.PathLike[str]) -> bool:
 
 
 def _write_torch(state: Mapping[str, Any], path: Path) -> None:
-    compact = {name: _without_reserve(value) for name, value in state.items()}
+    compact = {name: without_spare_memory(value) for name, value in state.items()}
     with_checksums = torch.serialization.get_crc32_options()
     torch.serialization.set_crc32_options(True)  # the default; verified by `_read_torch`
     try:
@@ -139,7 +139,7 @@ def _write_torch(state: Mapping[str, Any], path: Path) -> None:
         torch.serialization.set_crc32_options(with_checksums)
 
 
-def _without_reserve(value: Any) -> Any:
+def without_spare_memory(value: Any) -> Any:
     """A copy of a tensor that is a view of a larger storage, which torch would write as a whole."""
     if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
         return value.clone()

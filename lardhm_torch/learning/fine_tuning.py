@@ -13,7 +13,7 @@ from tqdm import tqdm
 from lardhm_torch import native
 from lardhm_torch.learning.fitting import balance_classes, label_factors, logistic_loss
 from lardhm_torch.learning.parameters import MapParameters
-from lardhm_torch.points import UNKNOWN, check_samples, to_map_frame
+from lardhm_torch.points import UNKNOWN, as_tensor, check_samples, to_map_frame
 from lardhm_torch.sampling import Samples, seeded_generator
 
 WARM_UP_STEPS = 20  # number of steps of the learning rate warm-up
@@ -111,21 +111,17 @@ def _check(
     Unknown points are left out: `fit` has made the map say 1/2 there, and tuning on them costs
     log-loss on held-out rays.
     """
-    points, labels = check_samples(
-        points, labels, model.dim, model.origin.device, keep_unknown=True
-    )
+    device = model.origin.device
+    is_known = as_tensor(labels, "labels", device) != UNKNOWN
+    points, labels = check_samples(points, labels, model.dim, device)
     if ray_id is not None:
-        ray_id = torch.as_tensor(ray_id, device=points.device)
-        if ray_id.shape != labels.shape:
+        ray_id = torch.as_tensor(ray_id, device=device)
+        if ray_id.shape != is_known.shape:
             raise ValueError(
-                f"ray_id must be ({len(labels)},), one per point; got {tuple(ray_id.shape)}"
+                f"ray_id must be ({len(is_known)},), one per point; got {tuple(ray_id.shape)}"
             )
-    known = labels != UNKNOWN
-    if bool(known.all()):
-        return LabelledPoints(points, labels, ray_id)
-    if not bool(known.any()):
-        raise ValueError("labels must hold 0 or 1; all are 1/2 (unknown)")
-    return LabelledPoints(points[known], labels[known], None if ray_id is None else ray_id[known])
+        ray_id = ray_id[is_known]
+    return LabelledPoints(points, labels, ray_id)
 
 
 def _hold_out(samples: LabelledPoints, fraction: float, rng: torch.Generator) -> Tensor | None:

@@ -237,9 +237,7 @@ def _fill_posterior(state: dict[str, Any], prefix: str) -> None:
 def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
     for name, _tensor in model.state_tensors():
-        value = state.get(prefix + name)
-        if isinstance(value, Tensor) and value.untyped_storage().nbytes() > value.nbytes:
-            state[prefix + name] = value.clone()
+        state[prefix + name] = map_files.without_spare_memory(state[prefix + name])
 
 
 def read_state(model: MapParameters) -> MapState:
