@@ -94,6 +94,50 @@ def test_octomap_full_trees_hold_the_clamped_log_odds(room, octomap, tmp_path):
     assert np.allclose(values[single], log_odds.clip(-2, 3.511), atol=1e-3)
 
 
+def cells_of_leaves(centers, edges, resolution):
+    """Centers (n, 3) of the cells that leaves cover, and the leaf (n,) of each."""
+    cells, owner = [], []
+    for leaf, (center, edge) in enumerate(zip(centers, edges, strict=True)):
+        side = (np.arange(np.rint(edge / resolution)) + 0.5) * resolution - edge / 2
+        cells.append(center + np.stack(np.meshgrid(side, side, side), -1).reshape(-1, 3))
+        owner += [leaf] * len(cells[-1])
+    return np.concatenate(cells), np.array(owner)
+
+
+def prune_all(tree, node) -> int:
+    """Prune a tree of pyoctomap below a node, children first; the number of nodes pruned."""
+    if not node.hasChildren():
+        return 0
+    children = [tree.getNodeChild(node, i) for i in range(8) if node.childExists(i)]
+    return sum(prune_all(tree, child) for child in children) + tree.pruneNode(node)
+
+
+def test_full_trees_are_pruned_as_pyoctomap_prunes_them(room, octomap, tmp_path):
+    pyoctomap = pytest.importorskip("pyoctomap", reason="pyoctomap is not installed")
+    count = save_grid(room, tmp_path / "map.ot", 0.4)
+    tree = pyoctomap.OcTree(0.4).read(str(tmp_path / "map.ot"))
+    leaves = [(*leaf.getCoordinate(), leaf.getSize()) for leaf in tree.begin_leafs()]
+    values = np.array([leaf.current_node.getValue() for leaf in tree.begin_leafs()])
+    _, centers, edges, _, expected = read_tree(octomap, tmp_path / "map.ot")
+    assert np.array_equal(leaves, np.column_stack([centers, edges]))
+    assert np.array_equal(values, expected)
+    # every cell of a pruned leaf has the value of the leaf
+    assert edges.max() > 0.5
+    cells, owner = cells_of_leaves(centers, edges, 0.4)
+    assert len(cells) == count
+    log_odds = cell_log_odds(room, cells, 0.4).clip(-2, 3.511)
+    assert np.allclose(log_odds, values[owner], atol=1e-3)
+    # lazy updates prune nothing: the same cells, then pruned by the library, are the same file
+    whole = pyoctomap.OcTree(0.4)
+    for cell, value in zip(cells, values[owner].tolist(), strict=True):
+        whole.updateNode(cell, value, True)
+    whole.updateInnerOccupancy()
+    assert whole.getNumLeafNodes() == count
+    assert prune_all(whole, whole.getRoot()) > 0
+    whole.write(str(tmp_path / "whole.ot"))
+    assert (tmp_path / "whole.ot").read_bytes() == (tmp_path / "map.ot").read_bytes()
+
+
 def test_a_map_of_real_scans_goes_to_octomap_and_back(data, octomap, tmp_path):
     scans = load_scans(data / "la3dm_sim_structured/scans.npz")
     samples = sample_rays(scans.select(torch.arange(0, len(scans), 5)), seed=0)

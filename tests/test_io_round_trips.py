@@ -16,7 +16,8 @@ UTM = np.array([500_000.0, 4_500_000.0, 100.0])
 
 def library(name):
     """An optional library, or a skip that says so."""
-    return pytest.importorskip(name, reason=f"{name} is not installed")
+    reason = f"{name} is not installed, or lacks a library of the system"
+    return pytest.importorskip(name, reason=reason, exc_type=ImportError)
 
 
 @pytest.mark.parametrize("write_ascii", [True, False])

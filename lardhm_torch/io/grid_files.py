@@ -42,7 +42,7 @@ def save_grid(
     |---|---|
     | ``.npz`` | ``probability`` (nx, ny, nz) float32 at the centers, ``lower`` (D,), ``resolution`` |
     | ``.bt`` | OctoMap: occupied and free cells, the rest unknown |
-    | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511) |
+    | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511), pruned |
 
     An OctoMap cell has the highest log-odds of the centers of its eight parts, since surfaces are
     thinner than cells and OctoMap too lets occupied win. It is known where they are 1 or more away
@@ -106,9 +106,8 @@ def _octomap_of(
     tree, count = new_tree(resolution), 0
     for centers, log_odds in _known_cells(model, first, last, resolution):
         for center, value in zip(to_array(centers), log_odds.tolist(), strict=True):
-            tree.updateNode(center, value, True)
+            tree.updateNode(center, value)  # prunes; a lazy update does not
         count += len(centers)
-    tree.updateInnerOccupancy()
     return tree, count
 
 
