@@ -40,6 +40,42 @@ def test_a_mesh_far_from_zero_keeps_its_shape_in_a_file(tmp_path, suffix, has_co
         assert np.array_equal(again.visual.vertex_colors, mesh.visual.vertex_colors)
 
 
+def vertices_of(library: str, path: str) -> np.ndarray:
+    """The vertices of a mesh file, as another library reads them."""
+    reason = f"{library} is not installed, or lacks a library of the system"
+    module = pytest.importorskip(library, reason=reason, exc_type=ImportError)
+    if library == "trimesh":
+        return module.load(path, force="mesh", process=False).vertices
+    if library == "open3d":
+        return np.asarray(module.io.read_triangle_mesh(path).vertices)
+    if library == "pymeshlab":
+        meshes = module.MeshSet()
+        meshes.load_new_mesh(path)
+        return meshes.current_mesh().transformed_vertex_matrix()
+    return module.read(path).points[:, :3]  # meshio puts the colors of .obj behind x y z
+
+
+READ_EXACTLY = {  # the table in docs/formats.md
+    "trimesh": (".ply", ".obj", ".off", ".glb"),
+    "pymeshlab": (".ply", ".obj", ".off", ".glb"),
+    "meshio": (".ply", ".obj", ".off"),
+    "pyvista": (".obj", ".off"),
+    "open3d": (".ply",),
+}
+
+
+@pytest.mark.parametrize(
+    ("library", "suffix"), [(name, s) for name, kinds in READ_EXACTLY.items() for s in kinds]
+)
+@pytest.mark.parametrize("has_colors", [True, False])
+def test_other_libraries_read_a_mesh_far_from_zero_exactly(library, suffix, has_colors, tmp_path):
+    mesh = some_ball(has_colors and suffix != ".off")
+    mesh.apply_translation([500_000.125, 4_500_000.25, 100])
+    save_mesh(mesh, tmp_path / f"ball{suffix}")
+    vertices = vertices_of(library, str(tmp_path / f"ball{suffix}"))
+    np.testing.assert_allclose(vertices, mesh.vertices, rtol=0, atol=1e-6)
+
+
 def test_an_stl_far_from_zero_says_how_coarse_it_is(tmp_path):
     mesh = some_ball()
     mesh.apply_translation([0, 4_500_000.25, 0])
