@@ -4,7 +4,9 @@
     python benchmarks/reading.py --compare PATH     # another checkout, read alternately
 
 All files hold the same points of the simulated room and are written to a temporary folder first.
-The page cache is warm: the figures are those of the readers, not of the disk.
+Folders of many small scans with a pose file stand for drives: there the time per file counts.
+The page cache is warm, and seconds are those of the processor: the figures are those of the readers,
+not of the disk or of other programs.
 """
 
 from __future__ import annotations
@@ -20,23 +22,24 @@ from pathlib import Path
 
 import numpy as np
 
+NUM_SCANS = 500  # of a folder
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
 
-# Run in the process of a checkout: the seconds of one reading of each file, best of three.
+# Run in the process of a checkout: the processor time of one reading of each file, best of three.
 TIMED = """
 import json, sys, time, warnings
 warnings.simplefilter("ignore")
 from lardhm_torch import load_scans
 seconds = {}
 for path in sys.argv[1:]:
-    has_origin = path.endswith((".ptx", ".npz", ".pcd", ".e57", ".ply"))
+    has_origin = path.endswith((".ptx", ".npz", ".pcd", ".e57", ".ply", "_scans"))
     options = {} if has_origin else {"origin": (1.0, 2.0, 3.0)}
     try:
         for _ in range(3):
-            begin = time.perf_counter()
+            begin = time.process_time()
             load_scans(path, **options)
-            taken = time.perf_counter() - begin
+            taken = time.process_time() - begin
             seconds[path] = min(taken, seconds.get(path, taken))
     except (ValueError, ImportError):
         seconds[path] = None
@@ -67,7 +70,30 @@ def write_files(folder: Path, count: int) -> list[Path]:
         write_las(folder / "a.laz", points, 6)
     if find_spec("pye57"):
         write_e57(folder / "a.e57", [points], np.eye(4)[None])
+    for suffix in ("bin", "pcd"):
+        write_drive(folder / f"{suffix}_scans", points, suffix)
     return sorted(folder.iterdir())
+
+
+def write_drive(folder: Path, points: np.ndarray, suffix: str) -> None:
+    """A folder of small scans, and its poses where the format has none."""
+    from healthy_files import write_pcd
+
+    folder.mkdir()
+    for number, scan in enumerate(np.array_split(points, NUM_SCANS)):
+        path = folder / f"{number:06d}.{suffix}"
+        if suffix == "pcd":
+            write_pcd(path, scan, "binary")
+        else:
+            np.hstack([scan, np.ones((len(scan), 1))]).astype("<f4").tofile(path)
+    if suffix == "bin":
+        np.savetxt(folder / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (NUM_SCANS, 1)))
+
+
+def megabytes(path: Path) -> float:
+    """Size of a file, or of all files of a folder."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files) / 1e6
 
 
 def timed(checkout: Path, files: list[Path]) -> dict[str, float | None]:
@@ -95,19 +121,23 @@ def main() -> None:
         for file in files:
             values = [[run[i][str(file)] for run in runs] for i in range(len(checkouts))]
             medians = [statistics.median(v) if None not in v else None for v in values]
-            rows.append({"file": file.name, "MB": file.stat().st_size / 1e6, "seconds": medians})
+            rows.append({"file": file.name, "MB": megabytes(file), "seconds": medians})
     if arguments.json:
         print(json.dumps(rows, indent=2))
         return
-    print(f"{'file':<26}{'MB':>8}{'MB/s':>9}{'Mpoints/s':>11}{'other MB/s':>12}")
+    print(f"{'file':<26}{'MB':>8}{'MB/s':>9}{'Mpoints/s':>11}{'other MB/s':>12}{'ratio':>7}")
     for row in rows:
         speeds = [None if s is None else row["MB"] / s for s in row["seconds"]]
-        other = f"{speeds[1]:.0f}" if len(speeds) > 1 and speeds[1] else "-"
+        other, ratio = "-", ""
+        if speeds[0] and len(speeds) > 1 and speeds[1]:
+            other, ratio = f"{speeds[1]:.0f}", f"{speeds[0] / speeds[1]:.2f}"
         if speeds[0] is None:
             print(f"{row['file']:<26} cannot be read")
             continue
         points = arguments.points / 1e6 / row["seconds"][0]
-        print(f"{row['file']:<26}{row['MB']:>8.1f}{speeds[0]:>9.0f}{points:>11.2f}{other:>12}")
+        print(
+            f"{row['file']:<26}{row['MB']:>8.1f}{speeds[0]:>9.0f}{points:>11.2f}{other:>12}{ratio:>7}"
+        )
 
 
 if __name__ == "__main__":

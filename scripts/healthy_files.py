@@ -143,7 +143,7 @@ def write_las(path: Path, points: np.ndarray, point_format: int) -> None:
 def write_kitti(folder: Path, points: np.ndarray) -> Path:
     """A KITTI scan; the folder gets its poses.txt too."""
     (folder / "poses.txt").write_text("1 0 0 5 0 1 0 6 0 0 1 7\n")
-    np.hstack([points, points[:, :1]]).astype("<f4").tofile(folder / "000000.bin")
+    np.hstack([points, abs(points[:, :1])]).astype("<f4").tofile(folder / "000000.bin")
     return folder / "000000.bin"
 
 

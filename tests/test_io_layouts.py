@@ -73,6 +73,36 @@ def test_kitti_files_are_read_as_ever(tmp_path, scale, fourth):
     np.testing.assert_allclose(scans.ends, points, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("fourth", [0.0, 1.0, 255.0])
+@pytest.mark.parametrize("place", range(0, 8000, 1000))
+def test_small_patches_of_one_intensity_are_read_as_kitti_files(tmp_path, place, fourth):
+    hits = simulate_room(num_rays=12_000, seed=3).hits.numpy()
+    patch = hits[np.linalg.norm(hits - hits[place], axis=1) < 0.6] - (0, 0, 1)
+    assert len(patch) > 30
+    rows = np.hstack([patch, np.full((len(patch), 1), fourth)]).astype("<f4")
+    rows.tofile(tmp_path / "a.bin")
+    scans = load_scans(tmp_path / "a.bin", origin=(0, 0, 0), strict=True)
+    np.testing.assert_array_equal(scans.ends, rows[:, :3])
+
+
+def test_coordinates_alone_that_vary_alike_may_have_three_or_four_columns(tmp_path):
+    ball = np.random.default_rng(0).normal(size=(2000, 3)).astype("<f4")
+    ball.tofile(tmp_path / "a.bin")
+    with pytest.raises(ValueError, match=r"a\.bin cannot be read: it may have three columns"):
+        load_scans(tmp_path / "a.bin", origin=(0, 0, 0))
+    ball[:1999].tofile(tmp_path / "a.bin")  # no whole number of points of four columns
+    np.testing.assert_array_equal(load_points(tmp_path / "a.bin"), ball[:1999])
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("step", [0.0, 2**-8])
+def test_doubles_that_were_floats_or_whole_steps_are_doubles(tmp_path, columns, step):
+    points = sensor_points().astype("f4").astype(np.float64)
+    points = np.round(points / step) * step if step else points
+    with_columns(points, columns, 2).astype("<f8").tofile(tmp_path / "a.bin")
+    np.testing.assert_array_equal(load_points(tmp_path / "a.bin"), points)
+
+
 def test_nuscenes_names_mean_five_columns(tmp_path):
     with_columns(sensor_points(), 5, 1).astype("<f4").tofile(tmp_path / "sweep.pcd.bin")
     scans = load_scans(tmp_path / "sweep.pcd.bin", origin=(0, 0, 0), strict=True)

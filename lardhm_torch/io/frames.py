@@ -87,7 +87,8 @@ def moved(readout: Readout, pose: FoundPose) -> Readout:
         ends=move_points(pose.world_from_sensor, readout.ends),
         origins=np.tile(pose.world_from_sensor[:3, 3], (readout.num_scans, 1)),
         origin_is_placeholder=False,
-    ).noting(*pose.notes, Note("points in the sensor frame, moved by the pose"))
+        notes=(*readout.notes, *pose.notes, Note("points in the sensor frame, moved by the pose")),
+    )
 
 
 def seen_from(readout: Readout, pose: FoundPose) -> Readout:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import Readout
@@ -33,6 +32,8 @@ def read_las(path: Path) -> Readout:
         ValueError: the header is not one of LAS, or the file is shorter than it says.
     """
     pieces = list(las_pieces(path))
+    if len(pieces) == 1:
+        return pieces[0]
     returns = [piece.target_index for piece in pieces if piece.target_index is not None]
     times = [piece.times for piece in pieces if piece.times is not None]
     withheld = sum(note.count or 0 for piece in pieces for note in piece.notes)
@@ -59,17 +60,20 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
         reader.header.point_count = header.count
         for points in reader.chunk_iterator(step):
             got += len(points)
-            yield _readout_of(points, reader.header.scales)
+            yield _readout_of(points)
     if got == 0 or got != header.count:
         raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
 
 
-def _readout_of(points: Any, scales: NDArray[np.float64]) -> Readout:
+def _readout_of(points: Any) -> Readout:
     """The points that are not withheld; what lies within half a step of zero is at zero."""
-    ends = np.stack([points.x, points.y, points.z], axis=1).astype(np.float64, copy=False)
-    near = np.abs(ends[:, 0]) < scales[0] / 2
+    ends = np.empty((len(points), 3))
+    for axis, name in enumerate("XYZ"):
+        np.multiply(points[name], points.scales[axis], out=ends[:, axis])
+        ends[:, axis] += points.offsets[axis]
+    near = np.abs(ends[:, 0]) < points.scales[0] / 2
     for axis in range(1, 3 if near.any() else 1):
-        near &= np.abs(ends[:, axis]) < scales[axis] / 2
+        near &= np.abs(ends[:, axis]) < points.scales[axis] / 2
     if near.any():
         ends[near] = 0
     has_times = "gps_time" in points.point_format.dimension_names
@@ -79,9 +83,11 @@ def _readout_of(points: Any, scales: NDArray[np.float64]) -> Readout:
         origin_cure="Put its trajectory.txt (GPS time, x, y, z a line) or a pose file beside it",
         times=np.array(points.gps_time, dtype=np.float64) if has_times else None,
     )
-    withheld = np.asarray(points.withheld).astype(bool)
-    count = int(withheld.sum())
-    return readout.select(~withheld).noting(Note(_WITHHELD, count)) if count else readout
+    withheld = np.asarray(points.withheld)
+    if not withheld.any():
+        return readout
+    is_kept = withheld == 0
+    return readout.select(is_kept).noting(Note(_WITHHELD, int((~is_kept).sum())))
 
 
 def _import_laspy(path: Path) -> Any:

@@ -67,8 +67,10 @@ def seen_from_track(readout: Readout, file: Path) -> Readout | None:
     Raises:
         ValueError: the trajectory is none, or does not cover the points.
     """
+    if readout.times is None or readout.dim != 3:
+        return None
     source = find_beside(file, _TRACK_FILES)
-    if source is None or readout.times is None or readout.dim != 3:
+    if source is None:
         return None
     track, is_only_track = _read_track(source, source.stat().st_mtime_ns)
     if track is None:

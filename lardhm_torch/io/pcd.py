@@ -87,6 +87,10 @@ def _pose(viewpoint: list[float]) -> NDArray[np.float64] | None:
     if not any(viewpoint[3:]):
         return None
     position, (w, x, y, z) = viewpoint[:3], viewpoint[3:]
+    if w == 1 and not any((x, y, z)):  # usual, and faster for many small scans
+        pose = np.eye(4)
+        pose[:3, 3] = position
+        return pose
     return poses_from_quaternions(np.array([position]), np.array([[x, y, z, w]]))[0]
 
 

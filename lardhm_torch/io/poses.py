@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -41,16 +42,29 @@ class FoundPose:
 
 @dataclass(frozen=True)
 class _Matched:
-    """Poses of the scans of a folder, by file name; NaN where there is none."""
+    """Poses of the scans of a folder, by file name; NaN where there is none.
+
+    Warnings are for the whole folder: the first scan has them, notes_of_others has none.
+    """
 
     poses: dict[str, NDArray[np.float64]]
     notes: tuple[Note, ...]
+    notes_of_others: tuple[Note, ...]
 
 
 def find_beside(path: Path, names: tuple[str, ...]) -> Path | None:
     """The first of some files that lies beside path or one folder up; None if there is none."""
-    folders = (path.parent, path.parent.parent)
-    return next((f / n for f in folders for n in names if (f / n).is_file()), None)
+    for folder in _folders_of(path):
+        for name in names:
+            if os.path.isfile(beside := os.path.join(folder, name)):
+                return Path(beside)
+    return None
+
+
+def _folders_of(path: Path) -> tuple[str, str]:
+    """The folder of a file and the one above, as strings: faster for each of many small scans."""
+    folder = os.path.dirname(path) or "."
+    return folder, os.path.dirname(folder) or "."
 
 
 def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
@@ -79,47 +93,47 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
         raise ValueError(
             f'poses_frame must be "camera" or "lidar" beside {source}; got {poses_frame!r}'
         )
-    folders = tuple(_changed(f) for f in {path.parent, path.parent.parent, source.parent.parent})
-    files = (source, *_calibrations(path.parent, source, folders))
+    places = _folders_of(path)
+    folders = tuple(map(_changed, (*places, _folders_of(source)[1])))
+    files = (str(source), *_calibrations(places[0], str(source), folders))
     stamps = (*folders, *map(_changed, files))
-    matched = _pose_of_each(path.parent, path.suffix.lower(), source, poses_frame, stamps)
-    pose, notes = matched.poses[path.name], matched.notes
-    if path.name != next(iter(matched.poses)):  # warnings are for the whole folder: once is enough
-        notes = tuple(replace(note, is_loss=False) for note in notes)
+    suffix = path.suffix.lower()
+    matched = _pose_of_each(places[0], suffix, str(source), poses_frame, stamps)
+    pose = matched.poses[path.name]
+    is_first = path.name == next(iter(matched.poses))
+    notes = matched.notes if is_first else matched.notes_of_others
     if np.isfinite(pose).all():
         return FoundPose(pose, notes)
     lost = Note(f"scans left out: {source.name} has no pose for them", 1, is_loss=True)
     return FoundPose(None, (lost, *notes))
 
 
-def _changed(path: Path) -> tuple[str, int]:
+def _changed(path: str) -> tuple[str, int]:
     """Changes when the file or folder does."""
-    return str(path), path.stat().st_mtime_ns
+    return path, os.stat(path).st_mtime_ns
 
 
 @lru_cache(maxsize=4)
-def _calibrations(
-    folder: Path, source: Path, stamps: tuple[tuple[str, int], ...]
-) -> tuple[Path, ...]:
-    found = [find_calibration(name, source, folder / "scan") for name in CALIBRATION_FILES]
-    return tuple(file for file in found if file is not None)
+def _calibrations(folder: str, source: str, stamps: tuple[tuple[str, int], ...]) -> tuple[str, ...]:
+    scan = Path(folder) / "scan"
+    found = [find_calibration(name, Path(source), scan) for name in CALIBRATION_FILES]
+    return tuple(str(file) for file in found if file is not None)
 
 
 @lru_cache(maxsize=4)
 def _pose_of_each(
-    folder: Path,
+    folder: str,
     suffix: str,
-    source: Path,
+    pose_file: str,
     poses_frame: str | None,
     stamps: tuple[tuple[str, int], ...],
 ) -> _Matched:
     """The pose of each file by its name; stamps keep the cache from getting old."""
-    names = sorted(
-        (f.name for f in folder.iterdir() if f.suffix.lower() == suffix and f.is_file()),
-        key=natural_key,
-    )
+    source = Path(pose_file)
+    files = (f for f in Path(folder).iterdir() if f.suffix.lower() == suffix and f.is_file())
+    names = sorted((f.name for f in files), key=natural_key)
     file = read_pose_file(source)
-    file, frame_notes = _of_lidar(file, source, folder / names[0], poses_frame)
+    file, frame_notes = _of_lidar(file, source, Path(folder) / names[0], poses_frame)
     stems = [name[: len(name) - len(suffix)] for name in names]
     poses, rule = _matched(file, source, stems)
     if not np.isfinite(poses).all(axis=(1, 2)).any():
@@ -128,7 +142,8 @@ def _pose_of_each(
             f"{_times_of(file, stems)}"
         )
     notes = (Note(f"poses from {source.name}"), *file.notes, *rule, *frame_notes)
-    return _Matched(dict(zip(names, poses, strict=True)), notes)
+    silent = tuple(replace(note, is_loss=False) for note in notes)
+    return _Matched(dict(zip(names, poses, strict=True)), notes, silent)
 
 
 def _matched(
