@@ -1,5 +1,6 @@
 """What readers say they assumed, sampling from the command line, and numbers that are negative."""
 
+import argparse
 import json
 import re
 
@@ -19,6 +20,7 @@ from lardhm_torch import (
     simulate_room,
 )
 from lardhm_torch.cli import main
+from lardhm_torch.cli.scan_files import iter_pieces_of
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.scan_files import iter_pieces
 from lardhm_torch.scans import every_scan, thin_rays
@@ -201,12 +203,20 @@ def test_thinning_keeps_rays_that_are_not_finite_and_needs_a_size():
         thin_rays(scans, 0)
 
 
-def test_every_is_refused_for_tiles_and_wrong_numbers_by_the_parser(room, tmp_path, capsys):
-    words = ["tile", room, "-o", tmp_path / "tiles"]
-    assert "--every is not for tiled maps" in fails(capsys, *words, "--every", 2)
-    for option in (["--every", "0"], ["--voxel", "-1"], ["--depth-scale", "inf"]):
-        with pytest.raises(SystemExit):
-            main([*map(str, words), *option])
+def test_every_is_refused_where_files_are_read_in_pieces():
+    with pytest.raises(ValueError, match="--every is not for tiled maps"):
+        next(iter_pieces_of(argparse.Namespace(every=2)))
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["tile --every 2", "fit --every 0", "fit --voxel -1", "tile --voxel 0", "info --depth-scale inf"],
+)
+def test_options_that_a_verb_lacks_and_wrong_numbers_are_refused_by_the_parser(words, capsys):
+    verb, *option = words.split()
+    with pytest.raises(SystemExit):
+        main([verb, "scans.npz", *option] + ([] if verb == "info" else ["-o", "out"]))
+    assert option[0] in capsys.readouterr().err
 
 
 def test_origins_of_positions_are_read_as_given(tmp_path):

@@ -198,7 +198,7 @@ def _evaluation_verbs(verb: Any) -> None:
 
 def _tile_verbs(verb: Any) -> None:
     sub = verb(tiling.tile)
-    add_scans(sub)
+    add_scans(sub, in_pieces=True)
     sub.add_argument("-o", "--output", required=True, metavar="FOLDER", help=FOLDER)
     add_ranges(sub)
     sub.add_argument("--edge", type=float, default=20.0, help="edge of a tile [m] (default: 20)")

@@ -6,15 +6,21 @@ import argparse
 import math
 
 
-def add_scans(sub: argparse.ArgumentParser, nargs: str = "+") -> None:
-    """Add SCANS, how the files are read, and which scans and rays are kept."""
+def add_scans(sub: argparse.ArgumentParser, nargs: str = "+", in_pieces: bool = False) -> None:
+    """Add SCANS, how the files are read, and which scans and rays are kept.
+
+    Verbs that read files in pieces do not count scans: they have no ``--every``.
+    """
     sub.add_argument(
         "scans", nargs=nargs, metavar="SCANS", help="scan file, several files, or a folder"
     )
     add_reading(sub)
-    sub.add_argument(
-        "--every", type=_count, default=1, metavar="N", help="read every Nth scan (default: 1)"
-    )
+    if in_pieces:
+        sub.set_defaults(every=1)
+    else:
+        sub.add_argument(
+            "--every", type=_count, default=1, metavar="N", help="read every Nth scan (default: 1)"
+        )
     sub.add_argument(
         "--voxel",
         type=_positive,
