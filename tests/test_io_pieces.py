@@ -6,7 +6,7 @@ import torch
 from scan_files import UTM, needs_laspy, some_points, write_las
 
 from lardhm_torch import Scans, save_scans
-from lardhm_torch.io.scan_files import iter_pieces, load_scans
+from lardhm_torch.io.scan_files import Reading, iter_pieces, load_scans
 from lardhm_torch.scans import concatenate_scans
 
 
@@ -69,7 +69,7 @@ def test_pieces_of_ply_are_the_rays_of_the_file(tmp_path, encoding):
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
 def test_pieces_of_las_are_the_rays_of_the_file(tmp_path, name):
     path = write_las(tmp_path / name, some_points() + UTM, np.arange(200) % 4)
-    pieces = list(iter_pieces(path, tuple(UTM), max_rays=64))
+    pieces = list(iter_pieces(path, Reading(tuple(UTM)), max_rays=64))
     assert_same_rays(pieces, load_scans(path, tuple(UTM)), 64)
 
 
@@ -99,7 +99,7 @@ def test_what_is_wrong_with_a_file_is_said_as_when_it_is_loaded(tmp_path):
         list(iter_pieces(path))
     save_scans(some_scans(), path)
     with pytest.raises(ValueError, match="origin must be left out when the files carry their own"):
-        list(iter_pieces(path, origin=(0, 0, 0)))
+        list(iter_pieces(path, Reading(origin=(0, 0, 0))))
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ValueError, match=r"a\.npz cannot be read"):
         list(iter_pieces(path))

@@ -14,7 +14,7 @@ from room_scan import (
 from scan_files import file_content, needs_laspy, pcd_header, write_poses
 
 from lardhm_torch.io.notes import ScanFileWarning, ScanReport
-from lardhm_torch.io.scan_files import iter_pieces, iter_scans, load_points, load_scans
+from lardhm_torch.io.scan_files import Reading, iter_pieces, iter_scans, load_points, load_scans
 
 IDENTITY = "0 0 0 1 0 0 0"
 FAR = np.array([500_000.0, 4_500_000.0, 100.0])
@@ -40,7 +40,7 @@ def every_reader(path, **options):
     return [
         len(load_scans(path, **options)),
         sum(map(len, iter_scans(path, **options))),
-        sum(map(len, iter_pieces(path, max_rays=100, **options))),
+        sum(map(len, iter_pieces(path, Reading(**options), max_rays=100))),
     ]
 
 
@@ -277,9 +277,12 @@ def test_a_folder_of_files_with_and_without_position_takes_an_origin_for_the_lat
     assert load_scans(tmp_path, origin=(1, 2, 3)).origins.tolist() == [POSITION.tolist(), [1, 2, 3]]
     (tmp_path / "b.xyz").unlink()
     write_pcd(tmp_path / "b.pcd", world_points(), "1.5 -0.75 1.25 1 0 0 0")
-    for read in (iter_scans, iter_pieces):
+    for scans in (
+        iter_scans(tmp_path, origin=(1, 2, 3)),
+        iter_pieces(tmp_path, Reading(origin=(1, 2, 3))),
+    ):
         with pytest.raises(ValueError, match="origin must be left out"):
-            list(read(tmp_path, origin=(1, 2, 3)))
+            list(scans)
 
 
 @pytest.mark.parametrize("frame", ["sensor", "world"])

@@ -22,7 +22,7 @@ from lardhm_torch import (
 from lardhm_torch.cli import main
 from lardhm_torch.cli.scan_files import iter_pieces_of
 from lardhm_torch.io.notes import Note
-from lardhm_torch.io.scan_files import iter_pieces
+from lardhm_torch.io.scan_files import Reading, iter_pieces
 from lardhm_torch.scans import every_scan, thin_rays
 
 
@@ -57,10 +57,17 @@ def room(tmp_path_factory):
 
 
 @pytest.mark.filterwarnings("ignore::lardhm_torch.io.notes.ScanFileWarning")
-@pytest.mark.parametrize("read", [load_scans, iter_scans, iter_pieces])
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda folder, report: load_scans(folder, report=report),
+        lambda folder, report: list(iter_scans(folder, report=report)),
+        lambda folder, report: list(iter_pieces(folder, Reading(report=report))),
+    ],
+)
 def test_a_report_counts_files_scans_rays_and_says_what_was_assumed(folder, read):
     report = ScanReport()
-    list(read(folder, report=report)) if read is not load_scans else read(folder, report=report)
+    read(folder, report)
     line = str(report)
     assert line.startswith("2 files: 2 scans, 400 rays; sensor at (1.5, -0.75, 1.25) m; ")
     assert "sensor position from VIEWPOINT; " in line
@@ -210,7 +217,13 @@ def test_every_is_refused_where_files_are_read_in_pieces():
 
 @pytest.mark.parametrize(
     "words",
-    ["tile --every 2", "fit --every 0", "fit --voxel -1", "tile --voxel 0", "info --depth-scale inf"],
+    [
+        "tile --every 2",
+        "fit --every 0",
+        "fit --voxel -1",
+        "tile --voxel 0",
+        "info --depth-scale inf",
+    ],
 )
 def test_options_that_a_verb_lacks_and_wrong_numbers_are_refused_by_the_parser(words, capsys):
     verb, *option = words.split()

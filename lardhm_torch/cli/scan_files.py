@@ -40,13 +40,13 @@ def iter_scans_of(arguments: argparse.Namespace, dim: int | None = None) -> Iter
 
 def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Iterator[Scans]:
     """The same in pieces of bounded size, for scans larger than memory."""
-    from lardhm_torch.io.scan_files import iter_pieces
+    from lardhm_torch.io.scan_files import Reading, iter_pieces
     from lardhm_torch.scans import thin_rays
 
     if arguments.every != 1:
         raise ValueError("--every is not for tiled maps, which read files in pieces")
     is_empty = True
-    for piece in iter_pieces(arguments.scans, **_reading(arguments)):
+    for piece in iter_pieces(arguments.scans, Reading(**_reading(arguments))):
         is_empty = False
         thinned = thin_rays(piece, arguments.voxel)
         _count_far(thinned, arguments)
@@ -57,9 +57,9 @@ def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Ite
 
 def describe_scans(arguments: argparse.Namespace) -> ScanReport:
     """What the readers find in the scans named on the command line, and what they assume."""
-    from lardhm_torch.io.scan_files import iter_pieces
+    from lardhm_torch.io.scan_files import Reading, iter_pieces
 
-    for _ in iter_pieces(arguments.scans, **_reading(arguments)):
+    for _ in iter_pieces(arguments.scans, Reading(**_reading(arguments))):
         pass
     report: ScanReport = arguments.report
     arguments.report = None  # the verb prints it itself

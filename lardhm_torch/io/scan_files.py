@@ -29,7 +29,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -88,34 +89,37 @@ _BAGS = (".bag", ".db3", ".mcap", "a ROS 2 bag")
 _FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rgbd_folder}
 
 
-class _Choice:
-    """How the caller wants files to be read."""
+@dataclass(frozen=True)
+class Reading:
+    """How the caller wants files to be read: the options of `load_scans`, which explains them."""
 
-    def __init__(
-        self,
-        origin: Sequence[float] | None,
-        frame: str | None,
-        poses_frame: str | None,
-        sensor_frame: str | None,
-        topic: str | Sequence[str],
-        camera: Camera | None,
-        strict: bool,
-    ) -> None:
-        if frame not in (None, "sensor", "world"):
-            raise ValueError(f'frame must be "sensor", "world" or None; got {frame!r}')
-        self.origin, self.frame, self.poses_frame = origin, frame, poses_frame
-        self.strict = strict
-        topics = (topic,) if isinstance(topic, str) else tuple(topic)
-        self.readers: dict[str, Callable[[Path], Readout]] = {
+    origin: Sequence[float] | None = None
+    frame: str | None = None
+    poses_frame: str | None = None
+    sensor_frame: str | None = None
+    topic: str | Sequence[str] = ()
+    camera: Camera | None = None
+    strict: bool = False
+    report: ScanReport | None = None
+
+    def __post_init__(self) -> None:
+        if self.frame not in (None, "sensor", "world"):
+            raise ValueError(f'frame must be "sensor", "world" or None; got {self.frame!r}')
+
+    @cached_property
+    def readers(self) -> dict[str, Callable[[Path], Readout]]:
+        """The reader of each extension and kind of folder, with its options."""
+        of_bags = partial(
+            read_bag,
+            topics=(self.topic,) if isinstance(self.topic, str) else tuple(self.topic),
+            poses_frame=self.poses_frame,
+            sensor_frame=self.sensor_frame,
+        )
+        return {
             **_READERS,
-            **dict.fromkeys(
-                _BAGS,
-                partial(
-                    read_bag, topics=topics, poses_frame=poses_frame, sensor_frame=sensor_frame
-                ),
-            ),
-            ".bin": partial(read_kitti, poses_frame=poses_frame),
-            "a folder of depth images": partial(read_rgbd, camera=camera or Camera()),
+            **dict.fromkeys(_BAGS, of_bags),
+            ".bin": partial(read_kitti, poses_frame=self.poses_frame),
+            "a folder of depth images": partial(read_rgbd, camera=self.camera or Camera()),
         }
 
 
@@ -163,9 +167,9 @@ def load_scans(
     Warns:
         ScanFileWarning: part of a file was left out.
     """
-    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
+    reading = Reading(origin, frame, poses_frame, sensor_frame, topic, camera, strict, report)
     files = expand_paths(path, _READERS, _kind_of_folder)
-    readouts = [_read(file, choice) for file in files]
+    readouts = [_read(file, reading) for file in files]
     if origin is not None and not any(readout.needs_origin for readout in readouts):
         raise unused_origin(origin, files)
     dims = {readout.dim: file for file, readout in zip(files, readouts, strict=True)}
@@ -175,7 +179,7 @@ def load_scans(
     placeholders = sum(map(_num_placeholders, readouts))
     scans = concatenate_scans(
         [
-            _finished(readout, file, choice, placeholders, report)
+            _finished(readout, file, reading, placeholders)
             for file, readout in zip(files, readouts, strict=True)
         ]
     )
@@ -220,8 +224,8 @@ def iter_scans(
         FileNotFoundError, ValueError, ImportError: see `load_scans`; raised when the file is read.
             That no file needs the origin given is raised at the end, unless there is one file only.
     """
-    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
-    for scans, moves in _scans_of_each_file(path, choice, report, max_rays=None):
+    reading = Reading(origin, frame, poses_frame, sensor_frame, topic, camera, strict, report)
+    for scans, moves in _scans_of_each_file(path, reading, max_rays=None):
         order = scans.scan_id.argsort(stable=True)
         counts = scans.scan_id.bincount(minlength=scans.num_scans).tolist()
         for number, rays in enumerate(order.split(PACKET_RAYS if moves else counts)):
@@ -236,34 +240,25 @@ def iter_scans(
 
 def iter_pieces(
     path: PathLike | Sequence[PathLike],
-    origin: Sequence[float] | None = None,
+    reading: Reading | None = None,
     *,
-    frame: str | None = None,
-    poses_frame: str | None = None,
-    sensor_frame: str | None = None,
-    topic: str | Sequence[str] = (),
-    camera: Camera | None = None,
-    strict: bool = False,
-    report: ScanReport | None = None,
     max_rays: int = PIECE_RAYS,
 ) -> Iterator[Scans]:
     """All rays of `load_scans` in order, a piece of at most ``max_rays`` at a time.
 
     LAS, LAZ, binary PLY and ``.npz`` files are read piece by piece and may be larger than memory;
-    of other files one at a time is held.
+    of other files one at a time is in memory.
 
-    Args and errors: as `iter_scans`; an error comes when the piece's turn comes.
+    Errors: as `iter_scans`; an error is raised when the piece is read.
     """
-    choice = _Choice(origin, frame, poses_frame, sensor_frame, topic, camera, strict)
-    for scans, _ in _scans_of_each_file(path, choice, report, max_rays):
+    for scans, _ in _scans_of_each_file(path, reading or Reading(), max_rays):
         for start in range(0, len(scans), max_rays):
             yield scans.select(torch.arange(start, min(len(scans), start + max_rays)))
 
 
 def _scans_of_each_file(
     path: PathLike | Sequence[PathLike],
-    choice: _Choice,
-    report: ScanReport | None,
+    reading: Reading,
     max_rays: int | None,
 ) -> Iterator[tuple[Scans, bool]]:
     """The scans of one file after the other, and whether each of their rays has its own origin.
@@ -271,29 +266,29 @@ def _scans_of_each_file(
     Some formats come in pieces of max_rays.
     """
     files = expand_paths(path, _READERS, _kind_of_folder)
-    origin_is_used, placeholders = choice.origin is None, 0
+    origin_is_used, placeholders = reading.origin is None, 0
     for number, file in enumerate(files):
         before = placeholders
-        for readout in _pieces(file, choice, max_rays):
+        for readout in _pieces(file, reading, max_rays):
             if readout.needs_origin:
                 origin_is_used = True
             elif len(files) == 1 and not origin_is_used:
-                raise unused_origin(choice.origin or (), files)
+                raise unused_origin(reading.origin or (), files)
             placeholders = before + _num_placeholders(readout)
-            if placeholders == 1 and number + 1 < len(files) and choice.origin is None:
+            if placeholders == 1 and number + 1 < len(files) and reading.origin is None:
                 # The first scan of a drive may stand at zero; if the next does, too, none does.
-                placeholders += _num_placeholders(_read(files[number + 1], choice))
-            scans = _finished(readout, file, choice, placeholders, report)
+                placeholders += _num_placeholders(_read(files[number + 1], reading))
+            scans = _finished(readout, file, reading, placeholders)
             yield scans, readout.times is not None and scans.num_scans > 1
     if not origin_is_used:
-        raise unused_origin(choice.origin or (), files)
+        raise unused_origin(reading.origin or (), files)
 
 
-def _pieces(file: Path, choice: _Choice, max_rays: int | None) -> Iterator[Readout]:
+def _pieces(file: Path, reading: Reading, max_rays: int | None) -> Iterator[Readout]:
     """The readout of a file, in pieces if max_rays is given and the format has a reader for it."""
     reader = None if file.is_dir() else _PIECE_READERS.get(file.suffix.lower())
     if reader is None or max_rays is None:
-        yield _read(file, choice)
+        yield _read(file, reading)
         return
     pieces = reader(file, max_rays)
     while True:
@@ -301,7 +296,7 @@ def _pieces(file: Path, choice: _Choice, max_rays: int | None) -> Iterator[Reado
             readout = next(pieces, None)
             if readout is None:
                 return
-            readout = _placed(readout, file, choice)
+            readout = _placed(readout, file, reading)
         yield readout
 
 
@@ -358,38 +353,37 @@ def _kind_of_folder(folder: Path) -> str | None:
     return next((kind for kind, is_kind in _FOLDER_KINDS.items() if is_kind(folder)), None)
 
 
-def _read(file: Path, choice: _Choice) -> Readout:
+def _read(file: Path, reading: Reading) -> Readout:
     """One file or folder through its reader; whatever is wrong names it."""
     kind = (_kind_of_folder(file) if file.is_dir() else None) or file.suffix.lower()
     with naming_errors(file):
-        return _placed(choice.readers[kind](file), file, choice)
+        return _placed(reading.readers[kind](file), file, reading)
 
 
-def _placed(readout: Readout, file: Path, choice: _Choice) -> Readout:
+def _placed(readout: Readout, file: Path, reading: Reading) -> Readout:
     """Points in the world frame, as far as it is known which frame they are in."""
     if file.suffix.lower() in _MAY_HOLD_ZEROS:
         readout = without_zeros(readout)
-    if choice.origin is None and choice.frame != "sensor":
+    if reading.origin is None and reading.frame != "sensor":
         tracked = seen_from_track(readout, file)
         if tracked is not None:
             return tracked
-    return placed(readout, file, choice.frame, choice.poses_frame)
+    return placed(readout, file, reading.frame, reading.poses_frame)
 
 
 def _finished(
     readout: Readout,
     file: Path,
-    choice: _Choice,
+    reading: Reading,
     num_placeholders: int,
-    report: ScanReport | None,
 ) -> Scans:
     """The readout as Scans, once its sensor positions are known and its notes accepted."""
-    readout = with_origins(readout, file, choice.origin, num_placeholders)
+    readout = with_origins(readout, file, reading.origin, num_placeholders)
     readout = note_not_finite(readout)
     scans = scans_from(readout, file)
-    check_notes(file, readout.notes, choice.strict)
-    if report is not None:
-        report.add(file, scans, readout.notes)
+    check_notes(file, readout.notes, reading.strict)
+    if reading.report is not None:
+        reading.report.add(file, scans, readout.notes)
     return scans
 
 
