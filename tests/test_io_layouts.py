@@ -163,6 +163,22 @@ def test_columns_go_by_the_names_that_a_header_gives(tmp_path, head, suffix):
 
 
 @pytest.mark.parametrize(
+    "head",
+    [
+        "x [mm],y [mm],z [mm]\n",
+        "X (ft),Y (ft),Z (ft)\n",
+        "# x(cm) y(cm) z(cm)\n",
+        '"x" (mm),"y" (mm),"z" (mm)\n',
+    ],
+)
+def test_coordinates_in_other_units_are_refused(tmp_path, head):
+    rows = "".join(",".join(map(repr, row)) + "\n" for row in world_points().tolist())
+    (tmp_path / "a.csv").write_text(head + rows)
+    with pytest.raises(ValueError, match=r"a\.csv.*column x is in (mm|ft|cm).*must be in meters"):
+        load_scans(tmp_path / "a.csv", origin=POSITION)
+
+
+@pytest.mark.parametrize(
     "comment",
     ["# the sensor was at x = 1, y = 2\n", "# points in x and y and z\n", "# x y z in meters\n"],
 )

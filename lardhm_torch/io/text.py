@@ -17,9 +17,12 @@ from lardhm_torch.io.records import read_table
 _PEEK_BYTES = 65_536
 _COMMENT_MARKS = ("#", "//", "%", ";", "!")
 _UNIT = re.compile(r"[\[(][^\])]*[\])]")  # [m], (m)
-_OTHER_NAMES = {
-    f"{name}{mark}{i}": "xyz"[i] for name in ("points", "coords") for mark in ":_" for i in range(3)
-}
+_NOT_METERS = re.compile(  # x [mm], "Y (ft)"
+    r"\b([xyz])[\"']?\s*[\[(]\s*([munpkcd]m|millim\w+|centim\w+|us-ft|ft|feet|foot|in|inch\w*)\s*[\])]",
+    re.I,
+)
+_ARRAYS = ("points", "coords", "points_m_xyz")  # of ParaView, PDAL, VeloView
+_OTHER_NAMES = {f"{name}{mark}{i}": "xyz"[i] for name in _ARRAYS for mark in ":_" for i in range(3)}
 _OTHER_NAMES |= {"easting": "x", "northing": "y", "east": "x", "north": "y"}
 _OTHER_NAMES |= dict.fromkeys(("height", "elevation", "altitude", "up"), "z")
 _UNIT_ENDING = re.compile(r"(_m|/m)$")
@@ -50,10 +53,11 @@ def read_text(path: Path) -> Readout:
     """Columns x y [z], and where a header names them ox oy oz, scan_id, is_return, target_index.
 
     Values are parted by commas, semicolons, tabs or spaces. The header is the first line, or the
-    last comment (# // % ; or !) that names x and y and fits the columns; units in brackets are passed
-    over. A line with one whole number before the table is its count of points (PTS); the file may
-    hold several such tables, each of them a scan. Without a header the first three columns (or two,
-    if there are no more) are the coordinates, and further ones are not read.
+    last comment (# // % ; or !) that names x and y and fits the columns; it may give units in
+    brackets, which must be meters for coordinates. A line with one whole number before the table is
+    its count of points (PTS); the file may hold several such tables, each of them a scan. Without a
+    header the first three columns (or two, if there are no more) are the coordinates, and further
+    ones are not read.
 
     Raises:
         ValueError: the file is empty or no text, a word is no number, x or y is missing, a count is
@@ -86,6 +90,7 @@ def _layout_of(lines: list[str], suffix: str) -> _Layout:
     comments, rest = lines[:num_comments], lines[num_comments:]
     skip_lines, names = num_comments, list[str]()
     if not all(map(_is_number, _words(rest[0], _delimiter(rest[0])))):
+        _check_units(rest[0])
         delimiter = _delimiter(rest[0])
         names = [_name(word) for word in _words(_UNIT.sub("", rest[0]), delimiter)]
         rest, skip_lines = rest[1:], skip_lines + 1
@@ -188,8 +193,19 @@ def _names_in_comments(comments: list[str], width: int) -> list[str]:
         for names in (words[-width:], words):
             fits = len(names) == width or (len(names) < width and names[:1] == ["x"])
             if fits and {"x", "y"} <= set(names):
+                _check_units(line)
                 return names
     return []
+
+
+def _check_units(header: str) -> None:
+    """Raise a ValueError where a header gives coordinates in another unit than meters."""
+    other = _NOT_METERS.search(header)
+    if other:
+        raise ValueError(
+            f"column {other[1].lower()} is in {other[2]}: coordinates must be in meters. Convert them, and "
+            "the header"
+        )
 
 
 def _counts_rows(column: NDArray[np.float64]) -> bool:
