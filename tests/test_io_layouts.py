@@ -235,6 +235,14 @@ def ptx(points, shape, position, matrix, columns=" 0.5"):
     return "\n".join(lines) + "\n"
 
 
+@pytest.mark.parametrize("head", ["", "240\n", "x y z\n", "# x y z\n"])
+@pytest.mark.parametrize("suffix", ["xyz", "txt", "pts"])
+def test_a_mark_of_utf_8_is_no_part_of_the_text(tmp_path, head, suffix):
+    content = head + "".join(" ".join(map(repr, row)) + "\n" for row in world_points().tolist())
+    (tmp_path / f"a.{suffix}").write_text(content, encoding="utf-8-sig")
+    np.testing.assert_array_equal(load_points(tmp_path / f"a.{suffix}"), world_points())
+
+
 @pytest.mark.parametrize("columns", [" 0.5", " 0.5 255 0 128"])
 @pytest.mark.parametrize("position", [POSITION, np.zeros(3)])
 def test_ptx_points_go_through_the_matrix_and_start_at_the_scanner(tmp_path, columns, position):

@@ -10,7 +10,7 @@ from scan_files import pcd_header, write_poses
 from scipy.spatial.transform import Rotation
 
 from lardhm_torch.io.notes import ScanFileWarning, ScanReport
-from lardhm_torch.io.scan_files import load_scans
+from lardhm_torch.io.scan_files import iter_scans, load_scans
 
 DRIVE = room_drive()
 CAMERA_FROM_LIDAR = np.eye(4)
@@ -246,9 +246,12 @@ def test_scans_beyond_the_trajectory_or_in_a_gap_are_left_out(tmp_path, ending):
     with pytest.warns(
         ScanFileWarning, match=r"scans left out: trajectory\.txt has no pose"
     ) as warned:
-        scans = load_scans(tmp_path, **how)
+        scans = load_scans(tmp_path, report=(report := ScanReport()), **how)
     assert np.allclose(scans.origins, drive.poses[[0, 3], :3, 3])
     assert len(warned) == 3
+    assert f"5 files: 2 scans, {len(scans)} rays" in str(report)  # the first file has no scan
+    with pytest.warns(ScanFileWarning):
+        assert len(list(iter_scans(tmp_path, report=ScanReport(), **how))) == 2
     for stem in stems:
         (tmp_path / f"{stem}{ending}").rename(tmp_path / f"9{stem}{ending}")
     with pytest.raises(
@@ -369,6 +372,19 @@ def test_a_line_of_nan_still_counts_where_lines_have_numbers(tmp_path, layout):
     with pytest.warns(ScanFileWarning, match=r"000001\.bin: 1 scans left out"):
         scans = load_scans(tmp_path)
     assert np.allclose(scans.origins, DRIVE.poses[[0, 2], :3, 3])
+
+
+@pytest.mark.parametrize("layout", ["kitti", "tum"])
+def test_a_mark_of_utf_8_before_the_first_line_is_no_part_of_it(tmp_path, layout):
+    write_scans(tmp_path)
+    more = np.concatenate([DRIVE.poses, DRIVE.poses + 1e-9])  # as many lines and more
+    if layout == "kitti":
+        write_poses(tmp_path / "poses.txt", more)
+    else:
+        write_tum(tmp_path / "poses.txt", np.arange(6.0), more)
+    text = (tmp_path / "poses.txt").read_bytes()
+    (tmp_path / "poses.txt").write_bytes(b"\xef\xbb\xbf" + text)
+    assert_rays(load_scans(tmp_path), DRIVE)
 
 
 def test_poses_of_16_numbers_are_whole_matrices(tmp_path):

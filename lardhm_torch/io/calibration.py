@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.records import text_encoding
 from lardhm_torch.io.trajectories import is_rigid
 
 CALIBRATION_FILES = (
@@ -62,7 +63,9 @@ def vehicle_from_lidar(*files: Path) -> NDArray[np.float64] | None:
     to_vehicle = find_calibration("calib_cam_to_pose.txt", *files)
     if to_laser is None or to_vehicle is None:
         return None
-    laser_from_camera = _rigid(to_laser, "the file", to_laser.read_text("latin-1").split())
+    laser_from_camera = _rigid(
+        to_laser, "the file", to_laser.read_text(text_encoding(to_laser)).split()
+    )
     entries = _entries(to_vehicle)
     if "image_00" not in entries:
         raise ValueError(f"{to_vehicle} must have an entry image_00:; got {', '.join(entries)}")
@@ -72,7 +75,7 @@ def vehicle_from_lidar(*files: Path) -> NDArray[np.float64] | None:
 
 def _entries(path: Path) -> dict[str, list[str]]:
     """Lines "name: numbers" (or without the colon), names in lower case."""
-    lines = [line.split() for line in path.read_text(encoding="latin-1").splitlines()]
+    lines = [line.split() for line in path.read_text(text_encoding(path)).splitlines()]
     return {words[0].rstrip(":").lower(): words[1:] for words in lines if words}
 
 

@@ -88,7 +88,8 @@ class ScanReport:
             self.files.append(file)
             self.num_scans += scans.num_scans
             self._corners += [*scans.origins.numpy()]
-            self._corners = [pick(self._corners, axis=0) for pick in (np.min, np.max)]
+            if self._corners:  # a file without a pose in time has no scan
+                self._corners = [pick(self._corners, axis=0) for pick in (np.min, np.max)]
         self.num_rays += len(scans)
         for note in notes:
             tally = self._notes.setdefault((note.text, note.cure), [0, None])

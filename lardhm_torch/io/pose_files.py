@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
-from lardhm_torch.io.records import read_table
+from lardhm_torch.io.records import read_table, text_encoding
 from lardhm_torch.io.trajectories import (
     Trajectory,
     check_rigid,
@@ -130,7 +130,7 @@ def read_track(path: Path) -> tuple[NDArray[np.float64] | None, int]:
 def _beginning(path: Path) -> tuple[list[str], int, str | None]:
     """Lines before the first line of numbers, how many numbers it has, what parts them."""
     before: list[str] = []
-    with open(path, encoding="latin-1") as file:
+    with open(path, encoding=text_encoding(path)) as file:
         for line in iter(lambda: file.readline(65_536), ""):
             text = line.partition("#")[0].strip()
             delimiter = next((mark for mark in ",;" if mark in text), None)

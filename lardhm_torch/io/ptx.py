@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lardhm_torch.io.no_returns import grid_directions
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import Readout
-from lardhm_torch.io.records import header_count
+from lardhm_torch.io.records import header_count, text_encoding
 from lardhm_torch.io.trajectories import check_rigid, move_points
 
 _HEADER_LINES = 10
@@ -51,7 +51,7 @@ def read_ptx(path: Path) -> Readout:
     """
     size = os.path.getsize(path)
     scans = []
-    with open(path, encoding="latin-1") as file:
+    with open(path, encoding=text_encoding(path)) as file:
         while (scan := _next_scan(file, size)) is not None:
             scans.append(scan)
     if not scans:

@@ -119,6 +119,12 @@ def read_ascii(
     return {name: table[:, i] for i, name in enumerate(wanted)}
 
 
+def text_encoding(path: Path) -> str:
+    """UTF-8 where a file begins with its mark, which editors on Windows write; else any bytes."""
+    with open(path, "rb") as file:
+        return "utf-8-sig" if file.read(3) == b"\xef\xbb\xbf" else "latin-1"
+
+
 def read_table(
     path: Path | TextIO,
     skip_lines: int,
@@ -143,6 +149,6 @@ def read_table(
             delimiter=delimiter,
             max_rows=max_rows,
             comments=comments,
-            encoding="latin-1",
+            encoding=text_encoding(path) if isinstance(path, Path) else None,
             ndmin=2,
         )

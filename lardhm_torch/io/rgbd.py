@@ -16,7 +16,7 @@ from lardhm_torch.io.paths import natural_key
 from lardhm_torch.io.pose_files import read_trajectory
 from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
-from lardhm_torch.io.records import read_table
+from lardhm_torch.io.records import read_table, text_encoding
 from lardhm_torch.io.trajectories import MAX_STAMP_GAP, Trajectory, check_rigid, move_points
 
 _INTRINSICS_FILES = ("camera-intrinsics.txt", "intrinsics.txt", "calibration.txt")
@@ -148,7 +148,7 @@ def _seven_scenes_frames(folder: Path) -> tuple[list[_Frame], int]:
 def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
     """The images that are listed, and how many are too far in time from a pose."""
     stamps, images = [], []
-    for line in image_list.read_text(encoding="latin-1").splitlines():
+    for line in image_list.read_text(text_encoding(image_list)).splitlines():
         words = line.partition("#")[0].replace(",", " ").split()
         if words:
             stamp, name = _depth_entry(words, image_list.name)
@@ -207,7 +207,7 @@ def _read_intrinsics(folder: Path) -> tuple[float, float, float, float]:
             "it: load_scans(path, camera=Camera(intrinsics=(fx, fy, cx, cy))), "
             "--camera FX,FY,CX,CY on the command line"
         )
-    lines = source.read_text(encoding="latin-1").splitlines()
+    lines = source.read_text(text_encoding(source)).splitlines()
     rows = [line.partition("#")[0].replace(",", " ").split() for line in lines]
     rows = [row for row in rows if row]
     try:

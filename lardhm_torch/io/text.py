@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import COLUMN_NAMES, Readout, readout_from_columns
-from lardhm_torch.io.records import read_table
+from lardhm_torch.io.records import read_table, text_encoding
 
 _PEEK_BYTES = 65_536
 _COMMENT_MARKS = ("#", "//", "%", ";", "!")
@@ -113,7 +113,7 @@ def _read_counted(path: Path, layout: _Layout, wanted: dict[str, int]) -> Readou
     """Tables that each have a count line before them, one scan each."""
     tables, count, skip = list[NDArray[np.float64]](), layout.count, layout.skip_lines
     size = path.stat().st_size
-    with open(path, encoding="latin-1") as file:
+    with open(path, encoding=text_encoding(path)) as file:
         for _ in range(skip):
             file.readline()
         while count is not None:
@@ -143,7 +143,7 @@ def _first_lines(path: Path) -> list[str]:
         start = file.read(_PEEK_BYTES)
     if b"\0" in start:
         raise ValueError("text is needed; the file holds zero bytes")
-    text = start.decode("latin-1").removeprefix("\xef\xbb\xbf")  # a UTF-8 mark of some editors
+    text = start.decode(text_encoding(path), errors="replace")
     lines = [line.strip() for line in re.split(r"\r\n|\r|\n", text)]
     return lines[:-1] if len(lines) > 1 and (len(start) == _PEEK_BYTES or not lines[-1]) else lines
 
@@ -203,8 +203,8 @@ def _check_units(header: str) -> None:
     other = _NOT_METERS.search(header)
     if other:
         raise ValueError(
-            f"column {other[1].lower()} is in {other[2]}: coordinates must be in meters. Convert them, and "
-            "the header"
+            f"column {other[1].lower()} is in {other[2]}: coordinates must be in meters. Convert them, "
+            "and the header"
         )
 
 
