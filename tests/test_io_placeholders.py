@@ -1,5 +1,6 @@
 """Poses that writers put when they know none, and points that are none."""
 
+import healthy_files
 import numpy as np
 import pytest
 from room_scan import (
@@ -33,6 +34,13 @@ def write_e57(path, scans, rotations=None, translations=None):
             rotation = None if rotations is None else rotations[number]
             translation = None if translations is None else translations[number]
             file.write_scan_raw(columns, rotation=rotation, translation=translation)
+
+
+def ptx(points, matrix):
+    """One scan of a PTX file with its pose: the matrix is for row vectors."""
+    rows = [matrix[:3, 3].tolist(), *matrix[:3, :3].T.tolist(), *matrix.T.tolist()]
+    lines = ["1", str(len(points)), *(" ".join(map(repr, row)) for row in rows)]
+    return "\n".join(lines + [" ".join(map(repr, row)) + " 0.5" for row in points.tolist()]) + "\n"
 
 
 def every_reader(path, **options):
@@ -144,6 +152,39 @@ def test_two_scans_of_an_e57_at_identity_are_registered_points_without_poses(tmp
     write_e57(tmp_path / "a.e57", [sensor_points()] * 2, [[1.0, 0, 0, 0]] * 2, [np.zeros(3)] * 2)
     with pytest.raises(ValueError, match="2 scans have it"):
         load_scans(tmp_path / "a.e57")
+
+
+@pytest.mark.parametrize("suffix", ["e57", "ptx"])
+@pytest.mark.parametrize(
+    ("shifts", "wrong"),
+    [([0, 4], []), ([4, 0, 7], []), ([4, 0, 0], [1, 2]), ([900, 0], [1]), ([0, 900, 901], [0])],
+)
+def test_an_identity_pose_among_others_is_one_of_the_first_scan_near_zero(
+    tmp_path, suffix, shifts, wrong
+):
+    """Where it cannot be one, the registered points of the scan are as far away as the others."""
+    poses = np.tile(np.eye(4), (len(shifts), 1, 1))
+    poses[:, 0, 3] = shifts
+    places = [shift or max(shifts) * (max(shifts) > 100) for shift in shifts]
+    ahead = np.array([1.0, 0, 0])
+    scans = [sensor_points() + gap * ahead for gap in np.subtract(places, shifts)]
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "e57":
+        pytest.importorskip("pye57", reason="pye57 is not installed (extra io)")
+        healthy_files.write_e57(path, scans, poses)
+    else:
+        path.write_text("".join(map(ptx, scans, poses)))
+    if wrong:
+        count = f"{len(wrong)} of {len(shifts)} scans, the first of them {wrong[0]}"
+        with pytest.raises(ValueError, match=rf"a\.{suffix} must say where.*for {count}"):
+            load_scans(path)
+    report = ScanReport()
+    read = load_scans(path, origin=(max(shifts), 2, 3) if wrong else None, report=report)
+    expected = np.where(np.isin(range(len(shifts)), wrong), max(shifts), shifts)
+    assert read.origins[:, 0].tolist() == expected.tolist()
+    ends = np.concatenate([sensor_points() + place * ahead for place in places])
+    np.testing.assert_allclose(read.ends, ends, rtol=0, atol=1e-4)
+    assert ("is taken for its own (guess" in str(report)) == (not wrong)
 
 
 @pytest.mark.parametrize("missing", [0, 1])

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
+from lardhm_torch.io.origins import with_identities
 from lardhm_torch.io.readout import Readout, rows_at_zero, whole_numbers
 from lardhm_torch.io.trajectories import move_points, poses_from_quaternions
 
@@ -21,7 +22,6 @@ _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _ZEROS = "points at exactly zero are left out (no measurement)"
 _NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
-_IDENTITY = np.eye(4)
 
 
 def read_e57(path: Path) -> Readout:
@@ -30,7 +30,8 @@ def read_e57(path: Path) -> Readout:
     Points that the scanner marked invalid are left out, as are those at exactly zero. Where it
     marked the range alone as invalid, the beam had no return: it is free up to the longest range
     of its scan. A field returnIndex gives target_index. Identity poses are what writers put when
-    they know none; a scan without a pose among scans with one has no known origin.
+    they know none (`with_identities`); a scan without a pose among scans with one has no known
+    origin.
 
     Raises:
         ImportError: pye57 is not installed.
@@ -77,15 +78,16 @@ def read_e57(path: Path) -> Readout:
 
 def _with_poses(readout: Readout, poses: list[NDArray[np.float64] | None]) -> Readout:
     """The readout with the position of each scan: NaN where there is no pose."""
-    moving = [pose for pose in poses if pose is not None and (pose != _IDENTITY).any()]
-    known = [pose for pose in poses if pose is not None]
-    if not known or (not moving and len(known) < len(poses)):
-        return readout
     unknown = np.full((4, 4), np.nan)
-    positions = np.stack([unknown if pose is None else pose for pose in poses])[:, :3, 3]
-    if not moving:
-        return replace(readout, origins=positions, origin_is_placeholder=True)
-    return replace(readout, origins=positions).noting(Note("scanner positions from the poses"))
+    matrices = np.stack([unknown if pose is None else pose for pose in poses])
+    is_identity = (matrices == np.eye(4)).all(axis=(1, 2))
+    is_real = np.isfinite(matrices).all(axis=(1, 2)) & ~is_identity
+    if not is_real.any() and not is_identity.all():
+        return readout
+    readout = with_identities(replace(readout, origins=matrices[:, :3, 3]), is_identity)
+    if is_identity.all():
+        return readout
+    return readout.noting(Note("scanner positions from the poses"))
 
 
 def _check_before_opening(path: Path) -> None:

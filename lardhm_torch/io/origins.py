@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import POSE_FILES
@@ -52,6 +53,26 @@ def with_origins(
     )
 
 
+def with_identities(readout: Readout, is_identity: NDArray[np.bool_]) -> Readout:
+    """The readout of a file with several poses, some of which (S,) are the identity.
+
+    If all of them are, they are placeholders (`with_origins`). One among others may be the scan
+    that the others are registered to, unless its points are far away; more than one are unknown.
+    """
+    assert readout.origins is not None
+    if is_identity.all() or not is_identity.any():
+        return replace(readout, origin_is_placeholder=bool(is_identity.all()))
+    scan = int(np.argmax(is_identity))
+    is_one = int(is_identity.sum()) == 1
+    ends = readout.ends if readout.scan_id is None else readout.ends[readout.scan_id == scan]
+    if is_one and _nearest(ends) <= FARTHEST_START:
+        cure = "the scan that the others are registered to; else export it with its pose"
+        return readout.noting(
+            Note(f"the identity pose of scan {scan} is taken for its own", cure=cure)
+        )
+    return replace(readout, origins=np.where(is_identity[:, None], np.nan, readout.origins))
+
+
 def _filled(readout: Readout, file: Path, origin: Sequence[float]) -> Readout:
     """The given origin where none is known, or only a placeholder."""
     if len(origin) != readout.dim:
@@ -83,12 +104,17 @@ def _why_placeholder_is_wrong(readout: Readout, file: Path, num_placeholders: in
     poses = find_beside(file, POSE_FILES)
     if poses is not None:
         return f"there is {poses.name} beside it"
-    ranges = np.linalg.norm(readout.ends[:: 1 + len(readout.ends) // 100_000], axis=1)
-    ranges = ranges[np.isfinite(ranges)]
-    near = float(np.quantile(ranges, 0.01)) if len(ranges) else 0.0
+    near = _nearest(readout.ends)
     if near > FARTHEST_START:
         return f"the points are {near:.0f} m and more from there"
     return ""
+
+
+def _nearest(ends: NDArray[np.float64]) -> float:
+    """How far the nearest points are from zero, but for a hundredth of them [m]."""
+    ranges = np.linalg.norm(ends[:: 1 + len(ends) // 100_000], axis=1)
+    ranges = ranges[np.isfinite(ranges)]
+    return float(np.quantile(ranges, 0.01)) if len(ranges) else 0.0
 
 
 def _hint(file: Path) -> str:

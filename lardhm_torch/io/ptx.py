@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lardhm_torch.io.no_returns import grid_directions
 from lardhm_torch.io.notes import Note
+from lardhm_torch.io.origins import with_identities
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.records import header_count, text_encoding
 from lardhm_torch.io.trajectories import check_rigid, move_points
@@ -66,15 +67,15 @@ def read_ptx(path: Path) -> Readout:
     if not any(map(len, ends)):
         raise ValueError("at least one point is needed; all are at exactly zero")
     poses = np.stack([scan.pose for scan in scans])
-    return Readout(
+    readout = Readout(
         np.concatenate(ends),
         poses[:, :3, 3].copy(),
         np.concatenate(scan_id),
         np.concatenate(is_return),
-        origin_is_placeholder=bool((poses == np.eye(4)).all()),
         origin_cure="Export the scans with their positions",
         notes=_notes(int(sum(map(np.sum, map(np.logical_not, is_return)))), lost),
     )
+    return with_identities(readout, (poses == np.eye(4)).all(axis=(1, 2)))
 
 
 def _notes(num_free: int, num_lost: int) -> tuple[Note, ...]:
