@@ -3,7 +3,7 @@
     python scripts/fuzz_readers.py --mutations 1000 --seed 0
 
 Each format runs in its own process with limits on time and memory, so that a crash of a compiled
-library is detected and reported. Exit code 0 if all formats pass.
+library is detected and reported. Exit code 0 if all formats pass. All of them take about 15 minutes.
 """
 
 from __future__ import annotations
@@ -309,7 +309,9 @@ def main() -> int:
         except BaseException:
             traceback.print_exc()
             return 1
-        print(f"{name}: {counts['read']} read, {counts['error']} clear errors", flush=True)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        said = f"{counts['read']} read, {counts['error']} clear errors, peak {peak:.0f} MiB"
+        print(f"{name}: {said}", flush=True)
     return 0
 
 

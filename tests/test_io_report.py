@@ -139,6 +139,7 @@ def test_hits_beyond_the_maximum_range_are_counted_in_the_line_of_fit(room, tmp_
     run("fit", *words, "-o", tmp_path / "map.pt")
     out, err = capsys.readouterr()
     assert out.startswith(f"{near} hits and ")
+    assert f"; {far} hits beyond 2.5 m (no hit" in out
     assert f"{far} rays: hits beyond 2.5 m (no hit, free space kept)\n" in err
     run("fit", *words, "--incremental", "-o", tmp_path / "stream.pt")
     assert f"; {far} hits beyond 2.5 m (no hit" in capsys.readouterr().out

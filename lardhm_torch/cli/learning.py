@@ -82,7 +82,10 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         _tune(model, scans, samples, state, arguments)
     model.save(arguments.output)
     hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
-    print(f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}")
+    print(
+        f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}"
+        f"{far_hits(arguments)}"
+    )
 
 
 def _new_map(dim: int, arguments: argparse.Namespace) -> LardHilbertMap:
