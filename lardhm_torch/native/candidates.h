@@ -17,7 +17,7 @@ constexpr int kWide = Simd<float>::W;
 using Wide = Simd<float>::V;
 using WideInt = Simd<float>::I;
 
-// Box of points, relative to the corner of the centers' box, grown by what rounding can do.
+// Box of points, relative to the corner of the centers' box, grown by the rounding error.
 template <int D>
 struct Region {
   float middle[D] = {}, half[D] = {};
@@ -54,7 +54,7 @@ struct LaneLists {
 inline constexpr LaneLists kLanes;
 #endif
 
-// Lanes of `bits` set to the front; writes a whole register.
+// Moves the lanes of `bits` to the front; writes a whole register.
 template <class X>
 inline void compress(uint32_t bits, const X* from, X* to) {
 #if defined(LARDHM_AVX512)
@@ -124,7 +124,7 @@ struct Blocks {
   std::vector<float> low[D], high[D];
   int64_t size = 0;
 
-  // Those of the index within the radius of the region.
+  // The blocks of the index within the radius of the region.
   void collect(const Index& index, const Region<D>& region, float radius) {
     block.resize(index.blocks + kWide);
     for (int d = 0; d < D; ++d) {

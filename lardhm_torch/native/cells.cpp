@@ -1,4 +1,4 @@
-// Which cells of space rays went through: a hash table of one bit a cell, as
+// Cells of space that rays pass through: a hash table with one bit per cell, as in
 // `sampling.unmarked_cells`.
 
 #include <algorithm>
@@ -19,7 +19,7 @@ constexpr int kGlanceBits = 22;                                 // 512 KB
 constexpr uint32_t kPrimes[3] = {73856093, 19349669, 83492791};  // as sampling.PRIMES
 constexpr int64_t kRaysPerTask = 256, kPointsPerTask = 8192;
 
-// Bits of a power of two of entries; a larger number counts by its low bits.
+// A power of two of bits; larger indices wrap around.
 class Bits {
   std::vector<std::atomic<uint32_t>> words;
   uint32_t last;
@@ -37,8 +37,8 @@ class Bits {
   }
 };
 
-// Rays mark entries that some point has: those are few, and most steps along a ray are over after a
-// glance at a small part of their bits, which nobody writes while rays are followed.
+// Rays mark only entries that belong to some point. These are few: most steps along a ray end after a
+// look at a small table, which is not written while rays are followed.
 struct Table {
   Bits glance{kGlanceBits}, asked{kTableBits}, crossed{kTableBits};
 
@@ -54,7 +54,7 @@ struct Table {
 
 constexpr uint32_t kEntries = (uint32_t(1) << kTableBits) - 1;
 
-// Entry of a cell. Only low bits count, so numbers of cells may wrap around.
+// Table entry of a cell. Only the low bits matter, so cell indices may wrap around.
 template <int D>
 uint32_t entry_of(const int64_t* cell) {
   uint32_t entry = 0;

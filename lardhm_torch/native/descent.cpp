@@ -1,6 +1,6 @@
 // Stochastic gradient descent over kept features, batch after batch.
 //
-// The same arithmetic as `fitting.batch_gradient` and `fitting.descend`, without an array a step.
+// The same arithmetic as `fitting.batch_gradient` and `fitting.descend`, without temporary arrays.
 
 #include <algorithm>
 #include <cmath>
@@ -37,7 +37,7 @@ template <int K, class Use>
 __attribute__((always_inline)) inline void for_indices(const int32_t* index, int64_t any_k,
                                                        const Use& use) {
   const int64_t k = K > 0 ? K : any_k;
-  asm("" : "+r"(index));  // else weights of many rows are gathered at once: half as long again
+  asm("" : "+r"(index));  // prevents gathers of the weights of many rows, which take 1.5 times as long
   for (int64_t j = 0; j + 1 < k; j += 2) {
     uint32_t pair[2];
     uint64_t both;
@@ -50,7 +50,7 @@ __attribute__((always_inline)) inline void for_indices(const int32_t* index, int
 }
 
 // Gradient of the loss of the rows begin .. end with respect to the weights, added to `slope`: the
-// residuals of some rows, then what they pull, so that no row waits for its own sigmoid.
+// residuals of some rows, then their gradients, so that no row waits for its own sigmoid.
 template <class T, int K>
 void add_gradient(const Rows<T>& rows, int64_t begin, int64_t end, const T* __restrict weights,
                   T* __restrict slope) {

@@ -45,7 +45,7 @@ struct Sharing {
 template <int D>
 constexpr double kPointsPerCell = 1 << D;
 
-// What one thread needs while it works through points.
+// Working memory of one thread.
 template <class T, int D>
 struct Scratch {
   Sorter sorter;
@@ -57,7 +57,7 @@ struct Scratch {
   std::vector<uint32_t> bits;  // lanes that select each of the list
   Sharing sharing{0, 0, 1};
   Region<D> region, group;
-  float far_radius = 0, near_radius = 0, radius = 0;  // [m] how far the lists and a packet look
+  float far_radius = 0, near_radius = 0, radius = 0;  // [m] search radius of the lists and of a packet
   AlignedArray<typename Simd<T>::I> distance;
   int64_t room = 0;
   Selection selected;
@@ -93,7 +93,7 @@ struct Engine {
   KthFn<T, D> kth;
   bool fades;  // as `features.fades`
   T origin[D];
-  float reach, smallest_radius;  // [m] edge of the centers' box; where guesses begin
+  float reach, smallest_radius;  // [m] edge of the centers' box; initial guess
 
   Engine(const T* points_, Parameters<T, D>& parameters_, int64_t k_)
       : index(parameters_.index), points(points_), parameters(parameters_),
@@ -251,7 +251,7 @@ struct Engine {
   void visit_filled(int64_t begin, int64_t n, int64_t total, Scratch<T, D>& s,
                     Visitor<T, D>& visitor) const {
     s.sharing = Sharing(total, index.header.count, W);
-    s.sorter.items.assign(n, 0);  // one cell of the Z curve: nothing to cut at
+    s.sorter.items.assign(n, 0);  // one cell of the Z curve: no border
     visit_region(begin, n, 0, n, s, visitor);
   }
 

@@ -50,7 +50,7 @@ struct BackwardVisitor final : Visitor<T, D> {
       for (int d = 0; d < D; ++d) grad_points[packet.row(lane) * D + d] = -towards[d][lane];
   }
 
-  // Of each cluster: z, the faded and masked kernel value, the share t of the k-th squared distance,
+  // Of each cluster: z, the faded and masked kernel value, the fraction t of the k-th squared distance,
   // the masked kernel value times the slope of the fade.
   static constexpr int kTerms = D + 3;
 
@@ -76,8 +76,8 @@ struct BackwardVisitor final : Visitor<T, D> {
     return g * p * sigmoid<T>(-sum);
   }
 
-  // Adds one cluster's share; y = inv(L)^T z, d log_odds / dc = w phi y, dL = w phi y z^T. The fade
-  // adds 2 w kernel slope (c - x) / d_k^2 to the center, and its part by d_k^2 to `reach`.
+  // Adds the gradient of one cluster; y = inv(L)^T z, d log_odds / dc = w phi y, dL = w phi y z^T.
+  // The fade adds 2 w kernel slope (c - x) / d_k^2 to the center, and its part by d_k^2 to `reach`.
   void cluster(const Packet<T, D>& packet, int32_t rank, V g, const V* z, V* towards, V& reach) {
     const T* shape = shapes + int64_t(rank) * L::shape;
     T* sum = sums + int64_t(rank) * L::gradient;

@@ -5,7 +5,7 @@
 // within d + 2h of the middle, and among those of all of its points if it is within d - 2h. So the
 // log-odds are at most the sum over the former with positive weights, each at its largest, plus that
 // over the latter with negative weights, each at its smallest: on a line, both are known exactly.
-// How far a cluster can have faded there follows from the same distances.
+// Bounds of the fade follow from the same distances.
 
 #pragma once
 
@@ -34,8 +34,8 @@ struct Intervals {
   void make_room() { bounds.resize(kQuarters * size()), nearby.resize(size()); }
 };
 
-constexpr double kRounding = 1e-5;  // share and log-odds added to a bound for float32
-constexpr double kSilent = 60;      // squared whitened distance beyond which a cluster adds 1e-13
+constexpr double kRounding = 1e-5;  // fraction and log-odds added to a bound for float32
+constexpr double kNegligible = 60;  // squared whitened distance beyond which a cluster adds 1e-13
 
 template <class T, int D>
 struct IntervalVisitor final : Visitor<T, D> {
@@ -60,7 +60,7 @@ struct IntervalVisitor final : Visitor<T, D> {
     V way[D], half, inner, nearby, sum[kQuarters] = {};
     gather(packet, way, half);
     for (int lane = 0; lane < W; ++lane) nearby[lane] = std::sqrt(packet.farthest[lane]);
-    inner = nearby - 2 * half;  // clusters within it answer all along
+    inner = nearby - 2 * half;  // clusters within it contribute everywhere
     inner = inner > 0 ? inner * inner * T(1 - kRounding) : V{};
     for (int64_t j = 0; j < selected.size; ++j) {
       const T* center = positions + int64_t(selected.rank[j]) * L::position;
@@ -122,9 +122,9 @@ struct IntervalVisitor final : Visitor<T, D> {
     for (int d = 1; d < D; ++d) zz += z[d] * z[d], zu += z[d] * u[d], uu += u[d] * u[d];
   }
 
-  // Adds weight exp(-squared / 2) in the lanes that are shown; whether any is worth it.
+  // Adds weight exp(-squared / 2) in the lanes that are shown; false if all are negligible.
   static void add(V squared, V weight, I shown, V& sum) {
-    const I seen = shown & (squared < T(kSilent));
+    const I seen = shown & (squared < T(kNegligible));
     if (!bits_of<T>(seen)) return;
     sum += seen ? exp_of<T>(T(-0.5) * squared) * weight : V{};
   }

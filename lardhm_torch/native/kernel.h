@@ -20,7 +20,7 @@ inline void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
   if constexpr (D == 3) z[2] = (offset[2] - z[0] * below[1] - z[1] * below[2]) * shape[2];
 }
 
-// How much of a neighbor's kernel is left at the share t of the k-th center's squared distance, as
+// Fade factor of a neighbor at the fraction t of the k-th center's squared distance, as
 // `features.neighbor_fade`.
 template <class T>
 inline typename Simd<T>::V fade_of(typename Simd<T>::V t) {

@@ -1,4 +1,4 @@
-// k-means: points to their nearest centers, moments of the points of each, centers that follow them.
+// k-means: assigns points to their nearest centers, sums their moments, and moves the centers.
 
 #include <cstdint>
 #include <cstring>
@@ -45,7 +45,7 @@ struct AssignVisitor final : Visitor<T, D> {
   }
 };
 
-// Moments of n points by the rank of their nearest center, in as many parts as are worth it.
+// Moments of n points by the rank of their nearest center, in as many parts as pay off.
 template <class T, int D>
 MomentParts<D> moments_of(const T* points, int64_t n, const T* centers, const Index& index,
                           bool scatter, int64_t* labels) {
@@ -95,7 +95,7 @@ void check_row_numbers(const Tensor& rows, int64_t count) {
   check(entries == 0 || largest < uint64_t(count), "row out of range");
 }
 
-// One batch: every point pulls its nearest center; `met` is how many pulled it since the restart.
+// One batch: every point moves its nearest center; `met` counts the points since the restart.
 template <class T, int D>
 void pull_centers(const std::vector<T>& batch, T* centers, int64_t count, std::vector<T>& met) {
   const CallIndex<T, D> call(nullptr, 0, centers, count);

@@ -39,7 +39,7 @@ struct MomentParts {
       for (int i = 0; i < moments; ++i) sum[i] += sums[(part * count + rank) * kMoments<D> + i];
   }
 
-  // As rows of tensors: counts, offsets and, where asked, symmetric scatters.
+  // As rows of tensors: counts, offsets and optionally symmetric scatters.
   template <class T>
   void write(const int32_t* order, T* counts, T* offsets, T* scatters) const {
     for (int64_t rank = 0; rank < count; ++rank) {

@@ -1,4 +1,4 @@
-// Log-odds, or probability, of every point: what a query writes.
+// Log-odds or probability of every point, as written by queries.
 
 #pragma once
 

@@ -11,7 +11,7 @@
 
 namespace lardhm {
 
-// exp(raw) of a register, in the range where it is a number.
+// exp(raw) of a register, clamped to the finite range.
 template <class T>
 inline typename Simd<T>::V lengthscales(typename Simd<T>::V raw) {
   using V = typename Simd<T>::V;

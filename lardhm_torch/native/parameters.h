@@ -11,7 +11,7 @@
 
 namespace lardhm {
 
-// Doubles where the linear algebra reads: position (x, y, z, -) and shape, each in one cache line.
+// Offsets in doubles: position (x, y, z, -) and shape, each in one cache line.
 template <int D>
 struct Layout {
   static constexpr int position = D == 3 ? 4 : 2;  // center
@@ -22,7 +22,7 @@ struct Layout {
 
 constexpr int64_t kPackGrain = 512;  // blocks packed in one go
 
-// What turns the clusters' raw factors into those of the kernel, L: below the diagonal
+// Converts the clusters' raw factors to those of the kernel, L: below the diagonal
 // sqrt(covariance_scale) raw, on it sqrt(covariance_scale) max(exp(raw), min_lengthscale).
 struct Scaling {
   double covariance_scale = 1, min_lengthscale = 0;

@@ -14,9 +14,9 @@
 namespace lardhm {
 namespace {
 
-// Neighbors of each point, ascending by row of the centers, and their kernel values where asked. Where
-// another order of the points is given they go to the point's place in it and are not sorted: who sums
-// over them all does not need it.
+// Neighbors of each point, ascending by row of the centers, and optionally their kernel values. If
+// another order of the points is given, they are written in that order and are not sorted: sums over
+// all neighbors do not need it.
 template <class T, int D, class Integer>
 struct NeighborVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
@@ -44,7 +44,7 @@ struct NeighborVisitor final : Visitor<T, D> {
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
     int64_t next[Simd<T>::W];
-    for (int lane = 0; lane < packet.lanes; ++lane) {  // there by the time that they are written
+    for (int lane = 0; lane < packet.lanes; ++lane) {  // prefetched before they are written
       next[lane] = first_of(packet.row(lane));
       __builtin_prefetch(rows + next[lane], 1);
       if (values) __builtin_prefetch(values + next[lane], 1);
@@ -60,8 +60,8 @@ struct NeighborVisitor final : Visitor<T, D> {
 
   static constexpr int kTogether = 64;
 
-  // The kernels of n <= 64 centers, then lane by lane those it selected: nearly always k of them, so
-  // that the processor knows how long the loop is.
+  // The kernels of n <= 64 centers, then lane by lane the selected ones: nearly always k of them, so
+  // that the length of the loop is predictable.
   void add(const Packet<T, D>& packet, const Selection& selected, const uint64_t* centers, int n,
            int64_t* next) const {
     alignas(64) T kernel[kTogether][Simd<T>::W];
@@ -141,7 +141,7 @@ Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t 
   return rows;
 }
 
-// Where each row comes to stand in an order of n rows.
+// Position of each row in an order of n rows (the inverse permutation).
 std::vector<int32_t> places_of(const Tensor& order, int64_t n) {
   check(order.scalar_type() == ScalarType::Long && order.numel() == n &&
             n < (int64_t(1) << 31),

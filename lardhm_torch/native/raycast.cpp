@@ -1,9 +1,9 @@
 // Rays against a map: the first obstacle along each, as `rays.py` defines it.
 //
-// Many rays go forward together. In every round each asks one thing: a bound for the interval of
-// steps before it, which is skipped where the bound is too low and halved where it is not; or the
-// log-odds at a few places, where a short interval could not be skipped and where the ridge or the
-// crossing is sought. What all of them ask is answered in packets of neighboring places.
+// Many rays advance together. In every round each ray requests one of two things: a bound for the
+// interval of steps ahead, which is skipped if the bound is too low and halved otherwise; or the
+// log-odds at a few points, if a short interval could not be skipped, and to locate the ridge or the
+// crossing. The requests of all rays are answered in packets of neighboring points.
 
 #include <algorithm>
 #include <cmath>
@@ -19,16 +19,16 @@
 namespace lardhm {
 namespace {
 
-constexpr int kStride = 4;             // steps of the shortest interval, whose log-odds are asked
+constexpr int kStride = 4;             // steps of the shortest interval, whose log-odds are evaluated
 constexpr int kFirst = 32;             // steps of the first interval
-constexpr double kShare = 1;           // most of an interval's half length over the distance of the k-th center
+constexpr double kShare = 1;           // most of half an interval over the distance of the k-th center
 constexpr int kBisections = 16;        // as in rays.py
 constexpr int kVertices = 2;           // parabolas, each a quarter as wide as the one before
 constexpr double kAhead = 0.1;         // of the longest range, where rays are sorted by place
-constexpr int64_t kWave = 1 << 15;     // rays that go forward together
+constexpr int64_t kWave = 1 << 15;     // rays that advance together
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
-// What is asked: steps [m], where to give up [m], log-odds of the threshold and of an obstacle.
+// Parameters: step [m], maximum range [m], log-odds of the threshold and of an obstacle.
 struct March {
   double step, max_range, level, target;
   bool ridge;
@@ -39,7 +39,7 @@ struct March {
 
 enum class Phase : int8_t { skip, search, climb, vertex, back, bisect, done };
 
-// One ray and how far it is.
+// One ray and its state.
 template <class T, int D>
 struct Ray {
   double origin[D], way[D];
@@ -62,7 +62,7 @@ struct Ray {
     intervals.slack.push_back(T(2 * half * (1 + kRounding)));
   }
 
-  // Past the quarters in which there is no obstacle.
+  // Skips the quarters in which there is no obstacle.
   void take_bound(const March& march, const T* bounds, double nearby) {
     int passed = 0;
     while (passed < kQuarters && bounds[passed] <= march.target) ++passed;
@@ -79,7 +79,7 @@ struct Ray {
     }
   }
 
-  // The places whose log-odds are asked next.
+  // The points whose log-odds are needed next.
   void ask(const March& march, std::vector<T>& points) const {
     if (phase == Phase::search || phase == Phase::climb)
       for (int i = 0; i < kStride; ++i) place(march.depth(next + i), points);
@@ -92,7 +92,7 @@ struct Ray {
     if (phase == Phase::bisect) place(0.5 * (low + high), points);
   }
 
-  // Takes the log-odds of the places asked; returns how many they were.
+  // Receives the log-odds of the requested points; returns their number.
   int take(const March& march, const T* values) {
     switch (phase) {
       case Phase::search: take_search(march, values); return kStride;
@@ -121,7 +121,7 @@ struct Ray {
     if (clear == 0) start_unknown(march);
   }
 
-  // On to the largest log-odds before they fall by 1.
+  // Advances to the largest log-odds before they fall by 1.
   void climb(const March& march, const T* values, int first) {
     phase = Phase::climb;
     for (int i = first; i < kStride && next + i <= march.last(); ++i) {
@@ -139,7 +139,7 @@ struct Ray {
     phase = Phase::vertex;
   }
 
-  // To the top of the parabola through three log-odds.
+  // Moves to the vertex of the parabola through three log-odds.
   void take_vertex(const March& march, const T* values) {
     const double before = values[0], here = values[1], after = values[2];
     const double bend = before - 2 * here + after;
@@ -149,7 +149,7 @@ struct Ray {
     if (++round == kVertices) phase = Phase::done;
   }
 
-  // Back to the last step below the level.
+  // Moves back to the last step below the level.
   void take_back(const March& march, const T* values) {
     for (int i = kStride - 1; i >= 0; --i) {
       const int64_t n = next - kStride + i;
@@ -177,8 +177,8 @@ struct Ray {
   double result() const { return clear < 0 ? kInfinity : high; }
 };
 
-// A box, map frame, outside of which no log-odds reach the target: at most k clusters answer, so one
-// of them must reach the k-th part of it.
+// A box, map frame, outside of which no log-odds reach the target: at most k clusters contribute, so
+// one of them must reach 1/k of it.
 template <class T, int D>
 Box<double, D> obstacle_box(const MapTensors& map, int64_t k, double target) {
   Box<double, D> box;
@@ -282,7 +282,7 @@ struct Wave {
   }
 };
 
-// The rays in an order in which neighbors start together and go the same way.
+// An order of the rays in which neighbors have similar origins and directions.
 template <int D>
 std::vector<uint64_t> sorted_rays(const double* origins, const double* ways, int64_t n,
                                   double ahead) {

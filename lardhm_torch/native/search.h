@@ -11,7 +11,7 @@
 
 namespace lardhm {
 
-// What is done with a packet and the clusters it selected, or with a point that is not finite.
+// Called with a packet and the clusters it selected, or with a point that is not finite.
 template <class T, int D>
 struct Visitor {
   virtual ~Visitor() = default;
@@ -24,8 +24,8 @@ template <class T, int D>
 void visit_all(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
                Visitor<T, D>& visitor);
 
-// The same in as many parts of the points as there are visitors, each with one of its own: what they
-// sum depends on the number of parts, not on the threads' timing.
+// The same in as many parts of the points as there are visitors, one per part: their sums depend on
+// the number of parts, not on the timing of the threads.
 template <class T, int D>
 void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t k,
                  const std::vector<Visitor<T, D>*>& visitors);
@@ -46,7 +46,7 @@ void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>&
 template <class T, int D>
 struct Scratch;
 
-// The search on one thread, which keeps its memory from call to call.
+// The search on one thread, with memory that is reused between calls.
 template <class T, int D>
 class Search {
  public:
@@ -63,7 +63,7 @@ class Search {
   std::unique_ptr<Scratch<T, D>> scratch;
 };
 
-// How many parts to sum in: one a thread, fewer where the sums outweigh the work.
+// Number of partial sums: one per thread, fewer if merging them would dominate.
 template <class T, int D>
 int64_t parts_of(int64_t n, int64_t bytes_of_sums, const Parameters<T, D>& parameters) {
   if (!parameters.packed.empty()) return 1;

@@ -1,4 +1,4 @@
-// Which points of a scan need another look: those without a cluster, those that may lie in one.
+// Selects points of a scan: those without a cluster, and those that may lie in one.
 
 #include <algorithm>
 #include <cmath>
@@ -11,13 +11,13 @@
 namespace lardhm {
 namespace {
 
-// The points whose row is to stay, in their order.
+// The points that are kept, in order.
 template <class T, int D, class Stays>
 Tensor points_that(const Tensor& points, const Stays& stays) {
   constexpr int64_t kGrain = 8192;
   const int64_t n = points.size(0), tasks = (n + kGrain - 1) / kGrain;
   std::vector<int64_t> first(tasks + 1, 0);
-  std::vector<int32_t> kept(n);  // in each task's own stretch, how far a row is from its begin
+  std::vector<int32_t> kept(n);  // rows relative to the begin of each task
   run_tasks(tasks, [&](int64_t task) {
     const int64_t begin = task * kGrain, size = std::min(n - begin, kGrain);
     int64_t staying = 0;

@@ -1,4 +1,4 @@
-// Vectors: one register of the widest kind the compiler was told about; exp and sigmoid of one.
+// Vectors: one register of the widest available kind, and its exp and sigmoid.
 
 #pragma once
 

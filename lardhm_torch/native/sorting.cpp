@@ -1,4 +1,4 @@
-// Boxes and sorting, compiled once for all that use them.
+// Boxes and sorting, compiled once.
 
 #include "sorting.h"
 
@@ -11,8 +11,8 @@
 namespace lardhm {
 namespace {
 
-constexpr int kRun = 16;    // rows a box takes in at a time
-constexpr int kKeyed = 128;  // rows keyed at a time: what is stored has left for the cache when it is loaded
+constexpr int kRun = 16;    // rows added to a box at a time
+constexpr int kKeyed = 128;  // rows keyed at a time: stores reach the cache before the loads
 
 // Widens the bounds by the finite numbers of one run; sums what is not finite.
 template <int Run, class T>

@@ -19,8 +19,8 @@ struct Box {
     }
   }
 
-  // Takes in the finite coordinates of every `step`-th of the rows begin .. end; false where some
-  // of them are not finite.
+  // Adds the finite coordinates of every `step`-th of the rows begin .. end; false if some of them are
+  // not finite.
   bool add(const T* points, int64_t begin, int64_t end, int64_t step);
 };
 

@@ -70,7 +70,7 @@ inline Tensor usable_index(const Tensor& index) {
   return tidy(index);
 }
 
-// The tensors of a map, checked and contiguous; `index` may be of other centers, and is then not used.
+// The tensors of a map, checked and contiguous; an `index` of other centers is ignored.
 struct MapTensors {
   Tensor centers, raw, weights, index;
   Scaling scaling;
@@ -93,7 +93,7 @@ struct MapTensors {
   }
 };
 
-constexpr int64_t kPointsOfFew = 64;  // fewer than clusters / 64: parameters packed as needed
+constexpr int64_t kPointsOfFew = 64;  // fewer than clusters / 64: parameters are packed on demand
 
 // Runs `work(parameters)` with all of a map's parameters, for a query of n points.
 template <class T, int D, class Work>

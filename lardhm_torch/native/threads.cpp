@@ -1,4 +1,4 @@
-// The only place that asks torch for threads; sources that need nothing else of it compile faster.
+// The only source that uses torch's thread pool; the others compile faster without its headers.
 
 #include "threads.h"
 

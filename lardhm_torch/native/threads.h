@@ -1,4 +1,5 @@
-// Threads: torch's pool; a forked child of a process that used it works alone (it would hang).
+// Threads of torch's pool. A forked child of a process that used the pool runs on one thread: the pool
+// would hang.
 
 #pragma once
 

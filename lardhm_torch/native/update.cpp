@@ -1,4 +1,5 @@
-// Scans into maps: points to the clusters that explain them, and which clusters a scan can touch.
+// Updates with scans: assigns points to the clusters that explain them, and finds the clusters that a
+// scan can change.
 
 #include <algorithm>
 #include <atomic>
@@ -82,7 +83,7 @@ void write_raw_factors(const Tensor& counts, const Tensor& scatters, double floo
   check(definite, "a covariance is not positive definite");
 }
 
-// Of the points that belong to each center: how many, their mean and their scatter about it.
+// Number, mean and scatter of the points of each center.
 template <class T, int D>
 void write_found(const MomentParts<D>& moments, const int32_t* order, const T* centers,
                  int64_t* counts, T* means, T* scatters) {
@@ -158,7 +159,7 @@ struct Extents {
     return true;
   }
 
-  // The norm of a row of the factor, most of which need no exponential to be found too short.
+  // The norm of a row of the factor; most rows are rejected without an exponential.
   bool extends(const T* factor, int d, T gap) const {
     T below = 0;
     for (int j = 0; j < d; ++j) below += factor[j] * factor[j];
