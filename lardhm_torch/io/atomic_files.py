@@ -1,4 +1,4 @@
-"""Atomic writing: a file is complete under its name, or it is not there."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the containers of ROS bags share: messages, chunks that are unpacked, values in a row."""
+"""Shared by the containers of ROS bags: messages, chunk decompression, binary values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from lardhm_torch.io.records import bytes_left
 
-_LEAST_BYTES = 16  # what an empty message counts for: bags without end are no bags either
+_LEAST_BYTES = 16  # least size of a message for the limit, so that empty messages count
 
 
 class Message(NamedTuple):
@@ -27,7 +27,7 @@ def common_kind(kind: str) -> str:
 
 
 class Unpacker:
-    """Unpacks the chunks of one file, with an end to how much they may come to together.
+    """Unpacks the chunks of one file, with a limit on their total size.
 
     Scans shrink by half or to a tenth; whole clouds of zeros to almost nothing, hence the constant.
     """
@@ -51,7 +51,7 @@ class Unpacker:
 
 
 def _decompressor(compression: str) -> Callable[[bytes, int], bytes]:
-    """A function of packed bytes and the number of bytes to stop at."""
+    """A function of the packed bytes and the largest size to unpack."""
     try:
         if compression == "bz2":
             import bz2
@@ -75,7 +75,7 @@ def _decompressor(compression: str) -> Callable[[bytes, int], bytes]:
 
 
 class Packed:
-    """Little-endian values from the front of a piece of memory."""
+    """Reads little-endian values from a buffer, one after the other."""
 
     def __init__(self, content: memoryview) -> None:
         self.content = content

@@ -87,7 +87,7 @@ def bag_parts(path: Path) -> BagParts:
 
     Raises:
         ValueError: a listed file is missing or still compressed, there is no file, or one part is
-            there in both formats and metadata.yaml does not say which one counts.
+            there in both formats and metadata.yaml does not say which one is valid.
     """
     if not path.is_dir():
         notes = _log_notes([path])

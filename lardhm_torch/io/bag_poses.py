@@ -70,11 +70,11 @@ class CloudPoses:
 
 @dataclass(frozen=True)
 class PoseSources:
-    """What a bag says about poses, and what the caller says about frames.
+    """The poses in a bag, and the frames that the caller named.
 
     Args:
         tree: of tf.
-        topics: of poses that may be used: one, or several that are not told apart.
+        topics: of poses that may be used: one, or several that cannot be distinguished.
         is_named: whether the caller named the topic.
         poses_frame: of which frame the poses of the topic are, if the caller says it.
         sensor_frame: the frame of the sensor, if the caller says it.
@@ -91,7 +91,7 @@ def cloud_poses(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -
     """The poses of clouds in a frame at (n,) stamps [s]; None if nothing in the bag gives them.
 
     Raises:
-        ValueError: frames are not connected, have two parents, or it is not clear which one counts.
+        ValueError: frames are not connected, have two parents, or it is not clear which one to use.
     """
     tree = sources.tree
     for name in (sources.sensor_frame, sources.poses_frame):

@@ -1,4 +1,4 @@
-"""The layout of binary points without a header, told from their values."""
+"""The layout of binary points without a header, recognized by their values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NUMBERS = (3, 4, 5, 6, 7, 8)  # of columns
 _CYCLE = 840  # a whole number of points for all of them
 _COLUMN_OF = np.hstack([np.tile(np.eye(n), (_CYCLE // n, 1)) for n in _NUMBERS])
 _STARTS = np.cumsum(_NUMBERS, dtype=np.int64) - np.array(_NUMBERS)
-_LEAST_POINTS = 30  # fewer do not tell the number of columns
+_LEAST_POINTS = 30  # with fewer, the number of columns cannot be recognized
 _CLEARLY = 0.3  # in mean log variance: another number of columns must fit KITTI's better by this
 _MULTIPLE = 1.0  # the same for twice as many columns, which always fit a little better
 _SIGN, _EXPONENT = np.uint32(1 << 31), np.uint32(0xFF << 23)  # bits of a float32
@@ -72,7 +72,7 @@ def _layout_of(values: NDArray, kind: str, fitting: list[int], is_nuscenes: bool
                 "values of coordinates. Convert the file to .npz, .pcd or .csv"
             )
         return KITTI
-    # Points of coordinates alone fit several: the first is meant.
+    # Coordinates alone fit several layouts: the first one is taken.
     return kind, next(n for n in fitting if scores[n] <= least + _CLEARLY / 2)
 
 

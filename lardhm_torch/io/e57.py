@@ -91,7 +91,7 @@ def _with_poses(readout: Readout, poses: list[NDArray[np.float64] | None]) -> Re
 
 
 def _check_before_opening(path: Path) -> None:
-    """Hold the header against the file, and refuse XML that can unfold to any size."""
+    """Check the header against the file size, and refuse XML whose entities may expand without limit."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         header = file.read(48).ljust(48, b"\0")
@@ -181,7 +181,7 @@ def _points_of(columns: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def _pose_of(header: Any) -> NDArray[np.float64] | None:
-    """(4, 4) world_from_scanner; None if the scan says nothing. Parts left out move nothing."""
+    """(4, 4) world_from_scanner; None without one. Missing parts of a pose are the identity."""
     if not header.has_pose():
         return None
     node = header.node["pose"]

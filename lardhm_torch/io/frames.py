@@ -1,4 +1,4 @@
-"""Points of formats that do not say which frame they are in, placed by a pose."""
+"""Points of formats that do not state their frame, placed by a pose."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _lacks_pose(readout: Readout, file: Path) -> bool:
 
 
 def _as_written(readout: Readout, file: Path) -> Readout:
-    """Points that nobody says the frame of: the world's, unless the file's pose says otherwise."""
+    """Points whose frame is not stated: world frame, unless the pose of the file rotates."""
     pose = readout.world_from_sensor
     if pose is None:
         return readout

@@ -55,7 +55,7 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
     got = 0
     laspy = _import_laspy(path)
     step = max_points or max(1, _BYTES_AT_A_TIME // header.point_bytes)
-    # One thread: the parallel reader takes memory by the chunk table's word.
+    # One thread: the parallel reader allocates what the chunk table claims.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
         reader.header.point_count = header.count
         for points in reader.chunk_iterator(step):
@@ -102,7 +102,7 @@ def _import_laspy(path: Path) -> Any:
 
 
 class _Header:
-    """The public header block, held against the file's size before anything is allocated."""
+    """The public header block, checked against the file size before anything is allocated."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         block = file.read(375).ljust(375, b"\0")
@@ -132,8 +132,8 @@ class _Header:
 def _check_compressed(file: BinaryIO, header: _Header) -> None:
     """Walk the chunks of a LAZ file by their headers alone.
 
-    The decompressor takes memory by the word of the file, and ends the program if it gets none: a
-    broken file must not reach it. A chunk in layers is one point as it is, the number of points,
+    The decompressor allocates what the file claims, and ends the program if that fails: a damaged
+    file must not reach it. A chunk in layers is one point as it is, the number of points,
     the bytes of each layer (all uint32), the layers.
     """
     items = _compressed_items(file, header)

@@ -53,7 +53,7 @@ def read_mcap(file: BinaryIO, unpack: Unpacker) -> Iterator[Message]:
     while True:
         operation, size = struct.unpack("<BQ", take(file, 9))
         body = Packed(take(file, size))
-        if operation in (2, 15):  # footer, end of data: what follows says all again
+        if operation in (2, 15):  # footer, end of data: a summary follows
             return
         if operation == 6:
             _, _, size, checksum = body.unpack("QQQI")

@@ -1,4 +1,4 @@
-"""Directions of beams that met nothing, from the grid that a scanner measures on."""
+"""Directions of beams without return, from the angular grid of a scanner."""
 
 from __future__ import annotations
 

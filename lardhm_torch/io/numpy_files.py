@@ -47,7 +47,7 @@ def npz_pieces(path: Path, max_points: int) -> Iterator[Readout]:
         names = [name for name in _RAY_ARRAYS if f"{name}.npy" in present]
         columns = {name: stack.enter_context(_Column(archive, name)) for name in names}
         if "points" not in columns or any(not column.in_rows for column in columns.values()):
-            yield read_npz(path)  # which says what is missing, or turns columns into rows
+            yield read_npz(path)  # reports missing arrays, or transposes
             return
         origins = _origins_of(archive, "scan_id" in columns)
         lengths = {name: column.length for name, column in columns.items()}

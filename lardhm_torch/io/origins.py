@@ -1,4 +1,4 @@
-"""Where the sensor of each scan stood: what the file says, what the caller says, what is refused."""
+"""Where the sensor of each scan stood: known from the file, given by the caller, or refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.scans import Scans
 
-FARTHEST_START = 100.0  # [m] a sensor at zero has something nearer than this
+FARTHEST_START = 100.0  # [m] a sensor at zero would have points nearer than this
 _GIVE_IT = "load_scans(path, origin=(x, y, z)), --origin X,Y,Z on the command line"
 
 
@@ -98,7 +98,7 @@ def _unknown(readout: Readout, file: Path) -> ValueError:
 
 
 def _why_placeholder_is_wrong(readout: Readout, file: Path, num_placeholders: int) -> str:
-    """What proves that no sensor stood at zero; empty if nothing does."""
+    """The reason why no sensor can have been at zero; empty if there is none."""
     if num_placeholders > 1:
         return f"{num_placeholders} scans have it"
     poses = find_beside(file, POSE_FILES)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 POSE_FILES = ("poses.txt", "groundtruth.txt", "trajectory.txt")
-# Text files that usually lie beside scans and are none.
+# Text files that often lie beside scans but are not scans.
 _NOT_SCANS = re.compile(
     r"(.*\.)?(poses?|groundtruth|trajectory|calib|times|timestamps|readme|licen[cs]e)\.txt", re.I
 )
@@ -84,7 +84,7 @@ def _scans_in(folder: Path, supported: Collection[str]) -> list[Path]:
 def naming_errors(file: Path) -> Iterator[None]:
     """A block that reads a file: errors name it."""
     try:
-        with np.errstate(invalid="ignore", over="ignore"):  # NaN and inf are the sampler's to count
+        with np.errstate(invalid="ignore", over="ignore"):  # sampling counts NaN and inf
             yield
     except ImportError:
         raise

@@ -1,8 +1,8 @@
 """PCD: ascii, binary and binary_compressed; VIEWPOINT is where the sensor stood.
 
-Whether VIEWPOINT is a viewpoint of points in the world frame (la3dm's published scans) or the
-transform of points in the sensor frame (CloudCompare), no file says. ``frame="world"`` or
-``frame="sensor"`` does; without it a VIEWPOINT that only shifts is taken for a viewpoint, and one
+Files do not state whether VIEWPOINT is the viewpoint of points in the world frame (la3dm) or the
+transform of points in the sensor frame (CloudCompare). ``frame="world"`` or
+``frame="sensor"`` decides; without it a VIEWPOINT that only shifts is taken for a viewpoint, and one
 that rotates is refused (`frames.placed`). VIEWPOINT 0 0 0 1 0 0 0 is what PCL, Open3D and pypcd4
 write when they know no pose. The header cannot say which beams met nothing; a field ``is_return``
 can.
@@ -170,7 +170,7 @@ def _encoding(words: list[str]) -> str:
 
 
 def _read_body(path: Path, file: BinaryIO, header: _Header) -> Columns:
-    """The named columns; bytes after the last point are left alone, PCL pads to whole pages."""
+    """The named columns; bytes after the last point are ignored, since PCL pads files to whole pages."""
     if header.encoding == "ascii":
         return read_ascii(path, header.num_lines, header.fields, header.count, bytes_left(file))
     if header.encoding == "binary":

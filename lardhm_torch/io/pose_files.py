@@ -1,4 +1,4 @@
-"""Pose files as text: KITTI's, KITTI-360's and TUM's lines, and what their comments say."""
+"""Pose files as text: lines of KITTI, KITTI-360 and TUM, and the columns named in comments."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class PoseFile:
 
 
 def read_pose_file(path: Path) -> PoseFile:
-    """The poses of a text file, told apart by the numbers a line has.
+    """The poses of a text file; the format follows from the count of numbers per line.
 
     | numbers | format | pose |
     |---|---|---|
@@ -128,7 +128,7 @@ def read_track(path: Path) -> tuple[NDArray[np.float64] | None, int]:
 
 
 def _beginning(path: Path) -> tuple[list[str], int, str | None]:
-    """Lines before the first line of numbers, how many numbers it has, what parts them."""
+    """Lines before the first line of numbers, how many numbers it has, and their delimiter."""
     before: list[str] = []
     with open(path, encoding=text_encoding(path)) as file:
         for line in iter(lambda: file.readline(65_536), ""):
@@ -198,7 +198,7 @@ def _tum(
 
 
 def _seconds(stamps: NDArray[np.float64], before: list[str]) -> float:
-    """What a stamp counts in [s]: by the unit in a comment, else by the size of the numbers."""
+    """The unit of stamps [s]: by the unit in a comment, else by the size of the numbers."""
     for comment in before:
         match = re.search(r"(?:time|stamp)\w*?[\s_]*[\[(]?(ns|us|µs|ms)\b", comment.lower())
         if match:

@@ -180,7 +180,7 @@ def _matched(
 
 
 def _by_line(file: PoseFile) -> Note:
-    """What to say of lines that were found by number."""
+    """The note for lines that were found by number."""
     steps = np.empty(0) if file.stamps is None else np.diff(file.stamps[np.isfinite(file.stamps)])
     if len(steps) > 1 and steps.max() > 2.5 * np.median(steps) and steps.min() > 0:
         cure = "scans named by stamp settle it"
@@ -261,7 +261,7 @@ def _of_lidar(
 def _camera_notes(
     file: PoseFile, camera_from_lidar: NDArray[np.float64], poses_frame: str | None
 ) -> tuple[Note, ...]:
-    """What to say of poses taken to be the camera's, which some programs do not write."""
+    """The notes for poses taken to be the camera's, which not all programs write."""
     if poses_frame == "camera":
         return (Note("poses of the camera, as given, moved to the lidar by Tr"),)
     moves = _moves_along(file.poses)

@@ -1,4 +1,4 @@
-"""What a reader found in a file, before it is known whether that is enough for Scans."""
+"""What a reader found in a file, before it is known whether it is complete."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Readout:
 
     @property
     def needs_origin(self) -> bool:
-        """Whether a sensor position given by the caller has a place here."""
+        """Whether a sensor position from the caller is needed."""
         if self.origins is None or self.origin_is_placeholder:
             return True
         return bool(np.isnan(self.origins).any())

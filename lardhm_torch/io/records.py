@@ -42,7 +42,7 @@ def header_lines(file: BinaryIO) -> Iterator[list[str]]:
     """The words of each header line, until the caller has seen the last one.
 
     Raises:
-        ValueError: the file ends, or something that is no header goes on for ever.
+        ValueError: the file ends, or no end of the header is found.
     """
     for _ in range(_MAX_HEADER_LINES):
         line = file.readline(_MAX_LINE_BYTES)

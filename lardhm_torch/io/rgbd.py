@@ -28,7 +28,7 @@ _NO_DEPTH = (0, 65535)
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """What a folder of depth images may not say.
+    """Camera of a folder of depth images, where the folder does not contain it.
 
     Args:
         intrinsics: fx, fy, cx, cy of the pinhole [pixels], lens distortion removed; None: a file

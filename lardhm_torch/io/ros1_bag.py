@@ -13,7 +13,7 @@ from lardhm_torch.io.records import bytes_left
 
 @dataclass
 class _Ros1:
-    """What the records so far have said."""
+    """Connections and topics of the records so far."""
 
     topics: dict[int, tuple[str, str]]
     num_chunks: int = 0
@@ -32,7 +32,7 @@ def read_ros1(file: BinaryIO, unpack: Unpacker) -> Iterator[Message]:
     take(file, *_word(file))
     while bytes_left(file):
         if file.tell() == index_at:
-            bag.num_connections = 0  # they are all said again
+            bag.num_connections = 0  # the connection records are repeated
         header = _ros1_header(take(file, *_word(file)))
         body = take(file, *_word(file))
         if _number(header, "op") == 5:

@@ -53,7 +53,7 @@ def _read_database(address: str, unpack: Unpacker) -> Iterator[Message]:
 
 
 def _sqlite_messages(connection: sqlite3.Connection, unpack: Unpacker) -> Iterator[Message]:
-    """Plain tables only: views and computed columns can stand for endless work."""
+    """Plain tables only: views and computed columns may take unlimited time."""
     described = connection.execute("SELECT type, name, sql FROM sqlite_master").fetchall()
     tables = {name for kind, name, _ in described if kind == "table"}
     if not {"topics", "messages"} <= tables:

@@ -349,12 +349,12 @@ def load_points(path: PathLike) -> Tensor:
 
 
 def _kind_of_folder(folder: Path) -> str | None:
-    """What a folder that is read as one is; None for a folder of scan files."""
+    """The kind of a folder that is read as a whole; None for a folder of scan files."""
     return next((kind for kind, is_kind in _FOLDER_KINDS.items() if is_kind(folder)), None)
 
 
 def _read(file: Path, reading: Reading) -> Readout:
-    """One file or folder through its reader; whatever is wrong names it."""
+    """Read one file or folder; errors name it."""
     kind = (_kind_of_folder(file) if file.is_dir() else None) or file.suffix.lower()
     with naming_errors(file):
         return _placed(reading.readers[kind](file), file, reading)

@@ -52,7 +52,7 @@ class _Layout:
 def read_text(path: Path) -> Readout:
     """Columns x y [z], and where a header names them ox oy oz, scan_id, is_return, target_index.
 
-    Values are parted by commas, semicolons, tabs or spaces. The header is the first line, or the
+    Values are separated by commas, semicolons, tabs or spaces. The header is the first line, or the
     last comment (# // % ; or !) that names x and y and fits the columns; it may give units in
     brackets, which must be meters for coordinates. A line with one whole number before the table is
     its count of points (PTS); the file may hold several such tables, each of them a scan. Without a

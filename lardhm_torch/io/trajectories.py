@@ -1,4 +1,4 @@
-"""Poses of a moving sensor: what they are made of, and the pose between two stamps."""
+"""Poses of a moving sensor, and interpolation between two stamps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_STAMP_GAP = 0.25  # [s] a pose is no farther than this from the time it is asked for
+MAX_STAMP_GAP = 0.25  # [s] largest distance in time to the nearest pose
 STAMP_ROUNDING = 1e-3  # [s] stamps are often written in milliseconds
 
 

@@ -22,7 +22,7 @@ class _Edge:
 
     @property
     def moves(self) -> bool:
-        """Whether the transform changes; one that was published once, or never changes, holds."""
+        """Whether the transform changes; one that never does is valid at all times."""
         return not self.is_static and any(row != self.rows[0] for row in self.rows)
 
     def at(self, stamps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
