@@ -11,7 +11,7 @@ from room_scan import (
     with_zeros,
     world_points,
 )
-from scan_files import write_poses
+from scan_files import pcd_header, write_poses
 
 from lardhm_torch import simulate_room
 from lardhm_torch.io.no_returns import grid_directions
@@ -330,6 +330,60 @@ def test_beams_without_return_of_a_ptx_have_the_direction_of_their_place_in_the_
     np.testing.assert_allclose(lengths, np.linalg.norm(points[~is_lost], axis=1).max(), rtol=1e-5)
     np.testing.assert_allclose(beams / lengths[:, None], directions[is_lost], rtol=0, atol=1e-5)
     assert f"{is_lost.sum()} beams without return" in str(report)
+
+
+def organized_pcd(path, points, shape, viewpoint):
+    """A PCD file of rows and columns; the points come row by row."""
+    header = pcd_header("binary", len(points), viewpoint=viewpoint).decode()
+    header = header.replace(f"WIDTH {len(points)}\nHEIGHT 1\n", "WIDTH {1}\nHEIGHT {0}\n")
+    path.write_bytes(header.format(*shape).encode() + points.astype("<f8").tobytes())
+
+
+HALF, SHIFT = 0.5**0.5, np.eye(4)
+SHIFT[:3, 3] = POSITION
+VIEWPOINTS = {  # where the points are, VIEWPOINT, and how the file is read
+    "identity": (np.eye(4), "0 0 0 1 0 0 0", {}),
+    "identity and origin": (np.eye(4), "0 0 0 1 0 0 0", {"origin": (0, 0, 0)}),
+    "shift": (SHIFT, "1.5 -0.75 1.25 1 0 0 0", {}),
+    "sensor frame": (pose(), f"1.5 -0.75 1.25 {HALF} 0 0 {HALF}", {"frame": "sensor"}),
+}
+
+
+@pytest.mark.parametrize("by_column", [True, False])
+@pytest.mark.parametrize("name", VIEWPOINTS)
+def test_points_of_nan_in_an_organized_pcd_are_beams_without_return(tmp_path, name, by_column):
+    world_from_sensor, viewpoint, how = VIEWPOINTS[name]
+    points, directions = grid_of_room()
+    is_lost = np.random.default_rng(1).random(600) < 0.2
+    order = np.arange(600) if by_column else np.arange(600).reshape(40, 15).T.ravel()
+    measured = np.where(is_lost[:, None], np.nan, points)
+    if "frame" not in how:
+        measured = measured + world_from_sensor[:3, 3]
+    shape = (40, 15) if by_column else (15, 40)
+    organized_pcd(tmp_path / "a.pcd", measured[order], shape, viewpoint)
+    report = ScanReport()
+    scans = load_scans(tmp_path / "a.pcd", report=report, **how)
+    turn, shift = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
+    hits = points[order][~is_lost[order]] @ turn.T + shift
+    np.testing.assert_allclose(scans.hits, hits, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(scans.origins[0], shift, rtol=0, atol=1e-12)
+    beams = (scans.ends[~scans.is_return].numpy() - shift) @ turn
+    longest = np.linalg.norm(points[~is_lost], axis=1).max()
+    expected = longest * directions[order][is_lost[order]]
+    np.testing.assert_allclose(beams, expected, rtol=0, atol=1e-9)
+    assert f"{is_lost.sum()} beams without return" in str(report)
+    with pytest.raises(ValueError, match="strict reading refuses a guess"):
+        load_scans(tmp_path / "a.pcd", strict=True, **how)
+
+
+def test_points_of_nan_stay_where_a_pcd_is_no_grid_of_angles_around_the_sensor(tmp_path):
+    points, _ = grid_of_room()
+    points[::7] = np.nan
+    for viewpoint, origin in (("0 0 0 1 0 0 0", (5, 5, 5)), ("5 5 5 1 0 0 0", None)):
+        organized_pcd(tmp_path / "a.pcd", points, (40, 15), viewpoint)
+        scans = load_scans(tmp_path / "a.pcd", origin=origin)
+        assert bool(scans.is_return.all())
+        np.testing.assert_array_equal(scans.ends, points)
 
 
 def test_zeros_of_a_ptx_that_is_no_grid_of_angles_are_left_out(tmp_path):

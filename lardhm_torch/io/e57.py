@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.no_returns import NO_RETURNS
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.origins import with_identities
 from lardhm_torch.io.readout import Readout, rows_at_zero, whole_numbers
@@ -21,7 +22,6 @@ _RECORDS_AT_A_TIME = 1 << 16
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _ZEROS = "points at exactly zero are left out (no measurement)"
-_NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
 
 
 def read_e57(path: Path) -> Readout:
@@ -163,7 +163,7 @@ def _scan_of(columns: dict[str, NDArray[np.float64]]) -> Readout:
     readout = readout if kept.all() else readout.select(kept)
     counts = {
         _ZEROS: int(((state == 0) & is_zero).sum()),
-        _NO_RETURNS: int(is_beam.sum()),
+        NO_RETURNS: int(is_beam.sum()),
         "points marked invalid are left out": int(((state != 0) & ~is_beam).sum()),
     }
     return readout.noting(*(Note(text, count) for text, count in counts.items() if count))

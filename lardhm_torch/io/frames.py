@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lardhm_torch.io.no_returns import seen_beams, with_free_beams
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import POSE_FILES
 from lardhm_torch.io.poses import FoundPose, find_beside, pose_beside
@@ -39,8 +40,9 @@ def placed(
     pose = pose_beside(file, poses_frame)
     if frame == "world":
         if pose is None or not readout.needs_origin:
-            return readout.noting(Note("points in the world frame, as given (frame)"))
-        return seen_from(readout, pose)
+            note = Note("points in the world frame, as given (frame)")
+            return seen_beams(readout).noting(note)
+        return seen_beams(seen_from(readout, pose))
     if pose is None and readout.world_from_sensor is not None:
         pose = FoundPose(readout.world_from_sensor, (Note("pose from the file itself"),))
     if pose is None or readout.dim != 3:
@@ -61,13 +63,14 @@ def _as_written(readout: Readout, file: Path) -> Readout:
     """Points whose frame is not stated: world frame, unless the pose of the file rotates."""
     pose = readout.world_from_sensor
     if pose is None:
-        return readout
+        return seen_beams(readout)
     if np.abs(pose[:3, :3] - np.eye(3)).max() > _LEAST_ROTATION:
         raise ValueError(
             "its pose (VIEWPOINT) rotates: the points may still be in the sensor frame. Say it: "
             'frame="sensor" moves them by the pose, frame="world" leaves them and takes the '
             "position alone; --frame on the command line"
         )
+    readout = seen_beams(readout)
     beside = find_beside(file, POSE_FILES)
     unused = "" if beside is None else f", and {beside.name} beside it is not used"
     return readout.noting(
@@ -82,6 +85,7 @@ def moved(readout: Readout, pose: FoundPose) -> Readout:
     """Points of the sensor frame moved into the world; no scan where the pose is missing."""
     if pose.world_from_sensor is None:
         return _left_out(readout, pose)
+    readout = with_free_beams(readout, np.zeros(readout.dim))
     return replace(
         readout,
         ends=move_points(pose.world_from_sensor, readout.ends),

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.notes import Note
+from lardhm_torch.io.readout import Readout
+
+NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
 _LARGEST_MISFIT = 0.5  # of a step of the grid
 
 
@@ -46,3 +51,44 @@ def grid_directions(
     directions[..., 1] = flat * np.sin(of_column)[:, None]
     directions[..., 2] = np.sin(of_row)
     return directions.reshape(-1, 3)
+
+
+def seen_beams(readout: Readout) -> Readout:
+    """`with_free_beams` for the known position of the only sensor; placeholders are not known."""
+    if readout.origins is None or len(readout.origins) != 1 or readout.origin_is_placeholder:
+        return readout
+    return with_free_beams(readout, readout.origins[0])
+
+
+def with_free_beams(readout: Readout, sensor: NDArray[np.float64]) -> Readout:
+    """The readout of an organized cloud with its points of NaN as beams without return.
+
+    Their directions follow from the grid, if it is one of angles around the sensor; else, and in
+    rows and columns without a point, they stay NaN.
+
+    Args:
+        readout: of one scan.
+        sensor: (3,) its position in the frame of the points [m].
+    """
+    if readout.grid is None or readout.is_return is not None or readout.dim != 3:
+        return readout
+    is_lost = np.asarray(~np.isfinite(readout.ends).all(axis=1))
+    if not is_lost.any() or is_lost.all():
+        return readout
+    points = readout.ends - sensor
+    by_column = np.arange(len(points)).reshape(readout.grid).T.ravel()
+    directions = np.full_like(points, np.nan)
+    found = grid_directions(points[by_column], readout.grid[::-1])
+    if found is not None:
+        directions[by_column] = found
+    elif (found := grid_directions(points, readout.grid)) is not None:  # one azimuth a row
+        directions = found
+    is_beam = np.asarray(is_lost & np.isfinite(directions).all(axis=1))
+    if not is_beam.any():
+        return readout
+    longest = np.linalg.norm(points[~is_lost], axis=1).max()
+    ends = readout.ends.copy()
+    ends[is_beam] = sensor + longest * directions[is_beam]
+    cure = "a field is_return says it"
+    note = Note(NO_RETURNS, int(is_beam.sum()), cure=cure)
+    return replace(readout, ends=ends, is_return=~is_beam).noting(note)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lardhm_torch.io.no_returns import seen_beams
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import POSE_FILES
 from lardhm_torch.io.poses import find_beside
@@ -48,9 +49,8 @@ def with_origins(
             f"{_GIVE_IT}.{_hint(file)}"
         )
     zero = ",".join("0" * readout.dim)
-    return readout.noting(
-        Note("identity pose taken for a sensor at zero", cure=f"--origin {zero} confirms it")
-    )
+    note = Note("identity pose taken for a sensor at zero", cure=f"--origin {zero} confirms it")
+    return seen_beams(replace(readout, origin_is_placeholder=False)).noting(note)
 
 
 def with_identities(readout: Readout, is_identity: NDArray[np.bool_]) -> Readout:
@@ -83,7 +83,7 @@ def _filled(readout: Readout, file: Path, origin: Sequence[float]) -> Readout:
     if readout.origins is not None and not readout.origin_is_placeholder:
         given = np.where(np.isnan(readout.origins), given, readout.origins)
     note = Note("sensor position as given (origin)")
-    return replace(readout, origins=given, origin_is_placeholder=False).noting(note)
+    return seen_beams(replace(readout, origins=given, origin_is_placeholder=False)).noting(note)
 
 
 def _unknown(readout: Readout, file: Path) -> ValueError:

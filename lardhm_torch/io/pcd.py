@@ -4,8 +4,8 @@ Files do not state whether VIEWPOINT is the viewpoint of points in the world fra
 transform of points in the sensor frame (CloudCompare). ``frame="world"`` or
 ``frame="sensor"`` decides; without it a VIEWPOINT that only shifts is taken for a viewpoint, and one
 that rotates is refused (`frames.placed`). VIEWPOINT 0 0 0 1 0 0 0 is what PCL, Open3D and pypcd4
-write when they know no pose. The header cannot say which beams met nothing; a field ``is_return``
-can.
+write when they know no pose. A field ``is_return`` says which beams met nothing; else points of NaN
+in an organized cloud are such beams, if its grid is one of angles (`no_returns.with_free_beams`).
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ class _Header:
     viewpoint: list[float] | None  # tx ty tz qw qx qy qz
     encoding: str
     num_lines: int
+    grid: tuple[int, int] | None  # rows and columns of an organized cloud
 
 
 def read_pcd(path: Path) -> Readout:
@@ -63,6 +64,7 @@ def read_pcd(path: Path) -> Readout:
     with open(path, "rb") as file:
         header = _read_header(file)
         readout = readout_from_columns(_read_body(path, file, header))
+    readout = replace(readout, grid=header.grid)
     if readout.origins is not None or header.viewpoint is None:
         return replace(readout, origin_cure=_CURE)
     position = np.array(header.viewpoint[: readout.dim])
@@ -106,7 +108,12 @@ def _read_header(file: BinaryIO) -> _Header:
         entries["FIELDS" if name == "COLUMNS" else name] = words[1:]
         if name == "DATA":
             return _Header(
-                _fields(entries), _count(entries), _viewpoint(entries), _encoding(words), number
+                _fields(entries),
+                _count(entries),
+                _viewpoint(entries),
+                _encoding(words),
+                number,
+                _grid(entries),
             )
     raise AssertionError("header_lines raises before it ends")
 
@@ -147,6 +154,15 @@ def _count(entries: dict[str, list[str]]) -> int:
             f"POINTS and WIDTH x HEIGHT must give one number of points; got {counts or 'none'}"
         )
     return counts[0]
+
+
+def _grid(entries: dict[str, list[str]]) -> tuple[int, int] | None:
+    """Rows and columns, where there are several of both; `_count` has checked them."""
+    lines = [entries.get(name, []) for name in ("HEIGHT", "WIDTH")]
+    if any(len(words) != 1 for words in lines):
+        return None
+    rows, columns = (int(words[0]) for words in lines)
+    return (rows, columns) if rows > 1 and columns > 1 else None
 
 
 def _viewpoint(entries: dict[str, list[str]]) -> list[float] | None:

@@ -11,7 +11,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from lardhm_torch.io.no_returns import grid_directions
+from lardhm_torch.io.no_returns import NO_RETURNS, grid_directions
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.origins import with_identities
 from lardhm_torch.io.readout import Readout
@@ -20,7 +20,6 @@ from lardhm_torch.io.trajectories import check_rigid, move_points
 
 _HEADER_LINES = 10
 _LEAST_BYTES = 8  # of the line of a point: "0 0 0 0"
-_NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def read_ptx(path: Path) -> Readout:
 def _notes(num_free: int, num_lost: int) -> tuple[Note, ...]:
     notes = [Note("scanner positions from the headers")]
     if num_free:
-        notes.append(Note(_NO_RETURNS, num_free))
+        notes.append(Note(NO_RETURNS, num_free))
     if num_lost:
         text = "points at exactly zero are left out (no measurement)"
         notes.append(Note(text, num_lost, is_loss=True))

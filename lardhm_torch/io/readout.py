@@ -30,6 +30,7 @@ class Readout:
         origin_cure: how a file of this format can carry its sensor position.
         notes: what was assumed or left out.
         times: (R,) float64 when each ray was measured [s], in the clock of the file.
+        grid: rows and columns of an organized cloud, whose rays come row by row.
     """
 
     ends: NDArray[np.float64]
@@ -42,6 +43,7 @@ class Readout:
     origin_cure: str = "Add columns ox oy oz"
     notes: tuple[Note, ...] = ()
     times: NDArray[np.float64] | None = None
+    grid: tuple[int, int] | None = None
 
     def noting(self, *notes: Note) -> Readout:
         """The same with more notes."""
@@ -51,9 +53,8 @@ class Readout:
         """The given rays (mask or indices), with all origins kept."""
         columns = ("ends", "scan_id", "is_return", "target_index", "times")
         values = {name: getattr(self, name) for name in columns}
-        return replace(
-            self, **{name: value[rays] for name, value in values.items() if value is not None}
-        )
+        kept = {name: value[rays] for name, value in values.items() if value is not None}
+        return replace(self, **kept, grid=None)
 
     @property
     def dim(self) -> int:
