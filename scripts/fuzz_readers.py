@@ -33,6 +33,7 @@ from healthy_files import (
     write_e57,
     write_kitti,
     write_las,
+    write_organized_pcd,
     write_pcd,
     write_ply,
     write_ply_lists,
@@ -75,6 +76,8 @@ def healthy_file(name: str, folder: Path) -> tuple[Path, Path]:
         columns.astype("<f4" if variant == "5" else "<f8").tofile(path)
     elif extension == "ply":
         write_ply(path, points, variant)
+    elif name == "pcd-organized":
+        write_organized_pcd(path, 20, NUM_POINTS // 20)
     elif extension == "pcd":
         write_pcd(path, points, variant)
     elif extension in ("las", "laz"):
@@ -162,7 +165,7 @@ FORMATS = {  # and the library that reads or makes them
     **dict.fromkeys(("ply-lists-ascii", "ply-lists-binary"), ""),
     **dict.fromkeys(("bin", "poses", "poses-tum", "map-pt"), ""),
     **dict.fromkeys(("ply-ascii", "ply-binary_little_endian", "ply-binary_big_endian"), ""),
-    **dict.fromkeys(("pcd-ascii", "pcd-binary", "pcd-binary_compressed"), ""),
+    **dict.fromkeys(("pcd-ascii", "pcd-binary", "pcd-binary_compressed", "pcd-organized"), ""),
     **dict.fromkeys(("las", "laz-6", "laz-3"), "lazrs"),
     **dict.fromkeys(("depth-png", "depth-pose", "depth-camera", "tum-list", "tum-poses"), "PIL"),
     "tum-pairs": "PIL",

@@ -73,14 +73,19 @@ def write_pts(path: Path, scans: Sequence[np.ndarray]) -> None:
     path.write_text("".join(tables))
 
 
+def grid_of_angles(columns: int, rows: int) -> np.ndarray:
+    """Points on a sphere, column by column: each column has one azimuth, each row one elevation."""
+    azimuth, elevation = np.meshgrid(np.arange(columns) / 10, np.arange(rows) / 20, indexing="ij")
+    beams = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)]
+    return 3 * np.stack([*beams, np.sin(elevation)], axis=-1).reshape(-1, 3).round(6)
+
+
 def write_ptx(path: Path, points: np.ndarray, poses: np.ndarray, with_zeros: bool) -> None:
     """One scan a pose, its points on a grid of 15 columns; with_zeros: a grid of angles with gaps."""
     rows = len(points) // 15
     points = points[: 15 * rows]
     if with_zeros:
-        azimuth, elevation = np.meshgrid(np.arange(15) / 10, np.arange(rows) / 20, indexing="ij")
-        beams = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)]
-        points = 3 * np.stack([*beams, np.sin(elevation)], axis=-1).reshape(-1, 3).round(6)
+        points = grid_of_angles(15, rows)
         points[::7] = 0
     text = ""
     for pose in poses:
@@ -106,6 +111,15 @@ def write_pcd(path: Path, points: np.ndarray, encoding: str) -> None:
         packed, size = compress_lzf(np.ascontiguousarray(rows.T).tobytes()), rows.nbytes
         body = len(packed).to_bytes(4, "little") + size.to_bytes(4, "little") + packed
     path.write_bytes(header.encode() + body)
+
+
+def write_organized_pcd(path: Path, columns: int, rows: int) -> None:
+    """A PCD file of a grid of angles, every seventh point of which is NaN."""
+    points = grid_of_angles(columns, rows).reshape(columns, rows, 3).swapaxes(0, 1).reshape(-1, 3)
+    points[::7] = np.nan
+    write_pcd(path, points + np.array([1, 2, 3]), "binary")
+    old, new = f"WIDTH {len(points)}\nHEIGHT 1\n", f"WIDTH {columns}\nHEIGHT {rows}\n"
+    path.write_bytes(path.read_bytes().replace(old.encode(), new.encode()))
 
 
 def compress_lzf(content: bytes) -> bytes:
