@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lardhm_torch.io.moving_sensor import TRACK_FILES
 from lardhm_torch.io.notes import Note
+from lardhm_torch.io.poses import find_beside
 from lardhm_torch.io.readout import Readout
 
+_ROWS = 1 << 14  # scaled at a time
 _BYTES_AT_A_TIME = 1 << 25
 _VLR_BYTES = 54
 _WITHHELD = "points flagged as withheld are left out"
@@ -52,6 +56,7 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
         header = _Header(file, path.stat().st_size)
         if header.is_compressed:
             _check_compressed(file, header)
+    with_times = find_beside(path, TRACK_FILES) is not None
     got = 0
     laspy = _import_laspy(path)
     step = max_points or max(1, _BYTES_AT_A_TIME // header.point_bytes)
@@ -60,26 +65,18 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
         reader.header.point_count = header.count
         for points in reader.chunk_iterator(step):
             got += len(points)
-            yield _readout_of(points)
+            yield _readout_of(points, with_times)
     if got == 0 or got != header.count:
         raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
 
 
-def _readout_of(points: Any) -> Readout:
+def _readout_of(points: Any, with_times: bool) -> Readout:
     """The points that are not withheld; what lies within half a step of zero is at zero."""
-    ends = np.empty((len(points), 3))
-    for axis, name in enumerate("XYZ"):
-        np.multiply(points[name], points.scales[axis], out=ends[:, axis])
-        ends[:, axis] += points.offsets[axis]
-    near = np.abs(ends[:, 0]) < points.scales[0] / 2
-    for axis in range(1, 3 if near.any() else 1):
-        near &= np.abs(ends[:, axis]) < points.scales[axis] / 2
-    if near.any():
-        ends[near] = 0
-    has_times = "gps_time" in points.point_format.dimension_names
+    target = np.asarray(points.return_number).astype(np.int64)
+    has_times = with_times and "gps_time" in points.point_format.dimension_names
     readout = Readout(
-        ends,
-        target_index=np.maximum(np.asarray(points.return_number, dtype=np.int64), 1),
+        _coordinates(points),
+        target_index=target if target.all() else np.maximum(target, 1),
         origin_cure="Put its trajectory.txt (GPS time, x, y, z a line) or a pose file beside it",
         times=np.array(points.gps_time, dtype=np.float64) if has_times else None,
     )
@@ -88,6 +85,23 @@ def _readout_of(points: Any) -> Readout:
         return readout
     is_kept = withheld == 0
     return readout.select(is_kept).noting(Note(_WITHHELD, int((~is_kept).sum())))
+
+
+def _coordinates(points: Any) -> NDArray[np.float64]:
+    """(n, 3) scaled coordinates, in blocks that fit in the cache."""
+    ends = np.empty((len(points), 3))
+    columns = [points[name] for name in "XYZ"]
+    for start in range(0, len(points), _ROWS):
+        block = ends[start : start + _ROWS]
+        is_zero = True
+        for axis, (scale, offset) in enumerate(zip(points.scales, points.offsets, strict=True)):
+            values = columns[axis][start : start + _ROWS] * scale + offset
+            if np.any(is_zero):
+                is_zero &= np.abs(values) < scale / 2
+            block[:, axis] = values
+        if np.any(is_zero):
+            block[is_zero] = 0
+    return ends
 
 
 def _import_laspy(path: Path) -> Any:

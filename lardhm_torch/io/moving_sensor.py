@@ -21,7 +21,7 @@ _FARTHEST = 50e3  # [m] from the points: positions in other coordinates are fart
 _WEEK = 604_800.0  # [s]
 _ADJUSTED = 1e9  # [s] LAS counts "adjusted standard GPS time" from here
 _UNIX = 315_964_800.0 - 18.0  # [s] GPS time counts from 1980 and, since 2017, is 18 s ahead
-_TRACK_FILES = (*POSE_FILES, "sbet.txt")
+TRACK_FILES = (*POSE_FILES, "sbet.txt")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def seen_from_track(readout: Readout, file: Path) -> Readout | None:
     """
     if readout.times is None or readout.dim != 3:
         return None
-    source = find_beside(file, _TRACK_FILES)
+    source = find_beside(file, TRACK_FILES)
     if source is None:
         return None
     track, is_only_track = _read_track(source, source.stat().st_mtime_ns)
