@@ -31,7 +31,12 @@ class TrainingPoints(NamedTuple):
 
 
 def training_points(
-    points: TensorLike, labels: TensorLike, like: Tensor, origin: Tensor | None = None
+    points: TensorLike,
+    labels: TensorLike,
+    like: Tensor,
+    origin: Tensor | None = None,
+    *,
+    keep_unknown: bool = False,
 ) -> TrainingPoints:
     """Validate samples and convert them to the frame and dtype of a map.
 
@@ -46,7 +51,7 @@ def training_points(
         ValueError: the samples are invalid, see `check_samples`.
     """
     points, labels = check_samples(
-        points, labels, like.shape[1], like.device, keep_unknown=origin is None
+        points, labels, like.shape[1], like.device, keep_unknown=keep_unknown or origin is None
     )
     labels = labels.to(like.dtype)
     if origin is not None:
