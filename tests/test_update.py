@@ -55,9 +55,7 @@ def test_evidence_does_not_depend_on_order_parts_or_repetitions(seed, parts):
     kept, of_kept = points[:0], owners[:0]
     for rows in torch.randperm(400, generator=rng).chunk(parts):
         more = torch.cat([rows, rows[:30]])
-        found = keep_points(
-            torch.cat([kept, points[more]]), torch.cat([of_kept, owners[more]]), 6
-        )
+        found = keep_points(torch.cat([kept, points[more]]), torch.cat([of_kept, owners[more]]), 6)
         inside = found[:, :, 0].isfinite()
         kept, of_kept = found[inside], inside.nonzero()[:, 0]
     assert torch.equal(found, whole)

@@ -12,6 +12,7 @@ from lardhm_torch.learning.clustering import Clusters, Columns
 
 EVIDENCE = 32  # E, number of points that a cluster keeps
 
+
 @dataclass(frozen=True, eq=False)
 class MapState(Columns):
     """All tensors of a map except its origin, with M rows each (see `LardHilbertMap`).

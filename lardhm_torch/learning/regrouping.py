@@ -56,9 +56,7 @@ class Rule(NamedTuple):
     floor: float
 
 
-def regrouped(
-    known: MapState, points: Tensor, rule: Rule, rng: torch.Generator
-) -> MapState:
+def regrouped(known: MapState, points: Tensor, rule: Rule, rng: torch.Generator) -> MapState:
     """Clusters of one class after new points of this class were added.
 
     Args:
@@ -101,7 +99,12 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     first, second = halves(known.evidence[rows])
     sizes = torch.stack([kept_counts(first), kept_counts(second)])
     balanced = sizes.amin(dim=0) >= MIN_COUNT
-    rows, first, second, sizes = rows[balanced], first[balanced], second[balanced], sizes[:, balanced]
+    rows, first, second, sizes = (
+        rows[balanced],
+        first[balanced],
+        second[balanced],
+        sizes[:, balanced],
+    )
     parents, share = known.rows(rows), sizes[0] / sizes.sum(dim=0)
     counts = (parents.counts * share).round().to(parents.counts)
     parts = [
@@ -113,9 +116,7 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     return known.put(rows, both), divided
 
 
-def _of_evidence(
-    evidence: Tensor, counts: Tensor, rule: Rule, weights: Tensor
-) -> MapState:
+def _of_evidence(evidence: Tensor, counts: Tensor, rule: Rule, weights: Tensor) -> MapState:
     """Clusters with the moments of their evidence, which represents ``counts`` points."""
     found = evidence_moments(evidence)
     clusters = _represented(found, torch.zeros_like(counts) if rule.kind == 2 else counts)
@@ -137,7 +138,9 @@ def _new_clusters(points: Tensor, rule: Rule, rng: torch.Generator) -> MapState:
     chosen = choose_num_clusters(points) * (2 if rule.kind == 1 else 1)
     found = cluster_points(points, min(chosen, most_clusters(len(points))), rng, NEW_ITERATIONS)
     clusters = _represented(found, torch.zeros_like(found.counts))
-    return new_rows(clusters, torch.full_like(found.counts, rule.kind == 0, dtype=torch.bool), rule.floor)
+    return new_rows(
+        clusters, torch.full_like(found.counts, rule.kind == 0, dtype=torch.bool), rule.floor
+    )
 
 
 def _nearest(points: Tensor, centers: Tensor) -> Tensor:
@@ -181,9 +184,7 @@ def _moved(state: MapState, rule: Rule, num_known: int) -> MapState:
     before = state.rows(rows)
     found = evidence_moments(before.evidence)
     clusters = _represented(found, before.counts)
-    old, new = (
-        factor_covariances(c.covariances, rule.floor) for c in (before.clusters, clusters)
-    )
+    old, new = (factor_covariances(c.covariances, rule.floor) for c in (before.clusters, clusters))
     raw = torch.where(
         (rows < num_known)[:, None, None],
         moved_factors(before.raw_scale_tril, old, new),

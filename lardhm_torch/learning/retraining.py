@@ -107,7 +107,10 @@ def trained(
     log_odds = (features[1][rows] * weights[features[0][rows]]).sum(dim=1)
     targets, batched = targets[rows], batched[rows]
     loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, targets, reduction="none")
-    return weights, (batched, loss + torch.xlogy(targets, targets) + torch.xlogy(1 - targets, 1 - targets))
+    return weights, (
+        batched,
+        loss + torch.xlogy(targets, targets) + torch.xlogy(1 - targets, 1 - targets),
+    )
 
 
 def _stalest(state: MapState, limit: int) -> Tensor:
