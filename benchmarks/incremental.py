@@ -49,7 +49,7 @@ SETS = (
     "kitti00_mulls",
     "sevenscenes_rgbd",
 )
-PAPER = UpdateConfig(as_in_paper=True, replay=0)
+PAPER = UpdateConfig(as_in_paper=True)
 Row = dict[str, Any]
 
 

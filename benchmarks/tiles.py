@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -21,7 +22,8 @@ from conditions import conditions
 
 from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
-from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.clustering import Clusters
+from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.learning.parameters import assign_state
 
 EDGE = 20.0  # [m] of a tile
@@ -41,16 +43,9 @@ def city(num_tiles: int, seed: int = 0) -> LardHilbertMap:
     weights = 4 * torch.randn(count, generator=rng)
     counts = torch.full((count,), 100)
     model = LardHilbertMap()
-    state = (
-        weights,
-        centers,
-        raw_factors(factors),
-        weights > 0,
-        counts,
-        centers,
-        factors @ factors.mT,
-    )
-    assign_state(model, MapState(*state))
+    rows = new_rows(Clusters(counts, centers, factors @ factors.mT), weights > 0, 0.01)
+    raw = raw_factors(factors)
+    assign_state(model, replace(rows, weights=weights, raw_scale_tril=raw))
     return model.requires_grad_(False)
 
 

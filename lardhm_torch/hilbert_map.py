@@ -45,6 +45,8 @@ class LardHilbertMap(parameters.MapParameters):
             that any value is valid. `scale_tril` holds the factors of the kernels [m].
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
             clusters of unknown points have count 0.
+        evidence: (M, 32, D) buffer [m], points kept by the clusters, padded with infinity.
+        losses, doubts, fresh: (M,) buffers, used by `update` (see docs).
         posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; a variance
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
@@ -276,19 +278,19 @@ class LardHilbertMap(parameters.MapParameters):
     ) -> LardHilbertMap:
         """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
 
-        New points are assigned to existing clusters near them; the remaining points form new
-        clusters. The weights near the scan are then trained on the new points and on pseudo-samples
-        drawn from the existing clusters. Parameters remain the same objects (see
-        `parameters.resize_optimizer` for stateful optimizers). If anything fails, the map is
-        unchanged.
+        Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
+        near them are regrouped, and the weights there are trained on the kept points. Parameters
+        remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
+        without points are removed, and the last rows take their places. If anything fails, the map
+        is unchanged.
 
         Args:
             points: (N, D) world positions [m]; an empty set leaves the map unchanged.
-            labels: (N,) 1 occupied, 0 free.
-            num_clusters: total over both classes for a scan of an unmapped place; points that are
-                assigned to existing clusters form no new ones. None: chosen from the data.
+            labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+            num_clusters: maximum number of clusters near the points, over all classes. None: chosen
+                from the number of hits there.
             seed: random seed of clustering and training.
-            config: update settings; `UpdateConfig(as_in_paper=True, replay=0)` follows the paper.
+            config: update settings; `UpdateConfig(as_in_paper=True)` follows the paper.
 
         Returns:
             This map.
@@ -303,7 +305,7 @@ class LardHilbertMap(parameters.MapParameters):
             return self
         if len(self) == 0:
             return self.fit(points, labels, num_clusters, seed=seed)
-        samples = training_points(points, labels, self.centers, self.origin)
+        samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "update", self.centers.device)
         task = Task(self.kernel, config or UpdateConfig(), rng)
@@ -334,6 +336,9 @@ class LardHilbertMap(parameters.MapParameters):
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
+        Clusters of surfaces and of unknown space that limit the remaining free space are kept, so that
+        places beyond the radius do not become free.
+
         Returns:
             This map.
 
@@ -341,7 +346,8 @@ class LardHilbertMap(parameters.MapParameters):
             ValueError: center is not (D,) and finite, or radius is not > 0.
         """
         center = map_merging.check_sphere(center, radius, self.origin)
-        state = map_merging.within(parameters.read_state(self), center - self.origin, radius)
+        state = parameters.read_state(self)
+        state = map_merging.within(state, center - self.origin, radius, self.kernel)
         parameters.write_state(self, state, self.origin)
         return self
 
@@ -357,9 +363,19 @@ class LardHilbertMap(parameters.MapParameters):
 
     # --- files ---
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state dict of the map to a file, atomically."""
-        map_files.save_state(self.state_dict(), path)
+    def save(self, path: str | os.PathLike[str], *, evidence: bool = True) -> None:
+        """Write the state dict of the map to a file, atomically.
+
+        Args:
+            path: file; the extension ``.safetensors`` selects that format.
+            evidence: write the points kept by the clusters, too. Without them, the file is about a
+                quarter as large, and a later `update` continues with points drawn from the moments of
+                the clusters.
+        """
+        state = self.state_dict()
+        if not evidence:
+            state = {name: value for name, value in state.items() if name not in parameters.HISTORY}
+        map_files.save_state(state, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:

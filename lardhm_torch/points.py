@@ -31,22 +31,28 @@ class TrainingPoints(NamedTuple):
 
 
 def training_points(
-    points: TensorLike, labels: TensorLike, like: Tensor, origin: Tensor | None = None
+    points: TensorLike,
+    labels: TensorLike,
+    like: Tensor,
+    origin: Tensor | None = None,
+    *,
+    keep_unknown: bool = False,
 ) -> TrainingPoints:
     """Validate samples and convert them to the frame and dtype of a map.
 
     Args:
         points: (N, D) world positions [m], at least one.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown; unknown points are dropped if ``origin`` is given.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
         like: (M, D) tensor of the map that defines dimension, dtype and device.
         origin: (D,) float64, the map's origin [m]. None: use the mean of the points, rounded to
             whole meters, and sort the points in Morton order.
+        keep_unknown: keep unknown points if ``origin`` is given; otherwise they are kept anyway.
 
     Raises:
         ValueError: the samples are invalid, see `check_samples`.
     """
     points, labels = check_samples(
-        points, labels, like.shape[1], like.device, keep_unknown=origin is None
+        points, labels, like.shape[1], like.device, keep_unknown=keep_unknown or origin is None
     )
     labels = labels.to(like.dtype)
     if origin is not None:

@@ -46,10 +46,9 @@ class StreamConfig:
 
 
 def real_time(config: StreamConfig | None = None) -> StreamConfig:
-    """Settings for real-time updates: all rays, with fewer free points, clusters and pseudo-samples.
+    """Settings for real-time updates: fewer points per scan, and fewer clusters trained per update.
 
-    An update takes about half the time: ten full 64-beam scans per second on two cores.
-    benchmarks/incremental.py measures the accuracy.
+    benchmarks/incremental.py measures time and accuracy.
 
     Args:
         config: settings to start from; None: the defaults.
@@ -58,12 +57,10 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
         New settings; ``config`` is unchanged.
     """
     config = config or StreamConfig()
-    fit = replace(config.update.fit, batch_size=2048)
     return replace(
         config,
-        max_clusters=6_800,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(config.update, replay=3, fit=fit),
+        update=replace(config.update, max_points=8_000, max_trained=1_000),
     )
 
 
@@ -173,10 +170,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         rows = torch.randperm(len(scan), generator=rng, device=rng.device)[: config.max_rays]
         scan = scan.select(rows.sort().values)
     try:
-        sampling = config.sampling
-        if len(model):  # `update` ignores unknown points
-            sampling = replace(sampling, behind_samples=0)
-        samples = sample_rays(scan, sampling, seed=seed)
+        samples = sample_rays(scan, config.sampling, seed=seed)
     except NoUsableRayError as error:
         warnings.warn(f"scan {number} was skipped: no usable ray; {error}", stacklevel=3)
         return

@@ -1,22 +1,18 @@
 """What an update asks of many points and clusters: the native pass against its definition."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from native_maps import dims, dtypes, kernel, make_map, make_points, true_distances
 
 from lardhm_torch import native
 from lardhm_torch.features import kernel_factors, raw_factors
-from lardhm_torch.learning.assignment import (
-    explain,
-    inside_candidates,
-    kernels_near,
-    ordered_features,
-    unexplained,
-)
+from lardhm_torch.learning.assignment import kernels_near, nearest_clusters, ordered_features
 from lardhm_torch.learning.cluster_matching import pool_into
 from lardhm_torch.learning.clustering import Clusters, cluster_points
-from lardhm_torch.learning.map_state import MapState, factor_covariances
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.evidence import keep_points
+from lardhm_torch.learning.map_state import factor_covariances, new_rows
 
 both_paths = pytest.mark.parametrize("native_path", [True, False])
 
@@ -34,81 +30,48 @@ def path(request, monkeypatch):
 @dims
 @dtypes
 @both_paths
-def test_points_near_their_center_have_an_owner_and_nearer_ones_count(
+def test_the_owner_of_a_point_is_the_nearest_cluster_within_the_radius(
     dtype, dim, native_path, path
 ):
     path(native_path)
     centers, raw, _ = make_map(40, dim, dtype)
     lower = raw.tril(-1) + torch.diag_embed(raw.diagonal(dim1=1, dim2=2).exp())
-    centers[7] = 100  # nobody joins it
     sizes = torch.arange(5, 45)
     clusters = Clusters(sizes, centers, lower @ lower.mT * (sizes - 1)[:, None, None])
     factors = factor_covariances(clusters.covariances, 0.01)
     points = make_points(4000, dim, dtype)
-    owners, found = explain(points, clusters, 0.01, 1.5, 3.0)
+    owners = nearest_clusters(points, clusters, 0.01, 3.0)
     nearest = true_distances(points, centers).argmin(dim=1)
-    offsets = (points - centers[nearest]).double()
-    solved = torch.linalg.solve_triangular(
-        factors[nearest].double(), offsets[:, :, None], upper=False
-    )
+    offsets = (points - centers[nearest]).double()[:, :, None]
+    solved = torch.linalg.solve_triangular(factors[nearest].double(), offsets, upper=False)
     distance = torch.linalg.vector_norm(solved, dim=(1, 2))
     assert 100 < (distance > 3).sum() < 3900
-    assert torch.equal(owners.long(), torch.where(distance <= 3, nearest, 40))
-    joins = distance <= 1.5
-    assert torch.equal(found.counts, nearest[joins].bincount(minlength=40))
-    assert found.counts[7] == 0
-    for row in range(40):
-        own = points[joins & (nearest == row)].double()
-        mean = own.mean(dim=0) if len(own) else centers[row].double()
-        torch.testing.assert_close(found.means[row], mean.to(dtype), rtol=1e-5, atol=1e-5)
-        scatter = (own - mean).T @ (own - mean)
-        torch.testing.assert_close(found.scatters[row], scatter.to(dtype), rtol=1e-5, atol=1e-5)
+    assert torch.equal(owners, torch.where(distance <= 3, nearest, -1))
 
 
 @dims
 @dtypes
-@both_paths
-@pytest.mark.parametrize("count", [0, 1, 40_000])
-def test_points_that_no_kept_cluster_owns_stay_in_order(dtype, dim, native_path, count, path):
-    path(native_path)
-    points = torch.arange(float(count * dim), dtype=dtype).reshape(count, dim)
+def test_native_evidence_equals_the_plain_one(ops, dtype, dim, monkeypatch):
     rng = torch.Generator().manual_seed(0)
-    owners = torch.randint(11, (count,), generator=rng, dtype=torch.int32)  # 10 is nobody
-    kept = torch.tensor([True, False] * 5)
-    rest = unexplained(points, owners, kept)
-    assert torch.equal(rest, points[(owners % 2 == 1) | (owners == 10)])
-
-
-@dims
-@dtypes
-@both_paths
-def test_all_points_inside_a_cluster_are_possibly_inside(dtype, dim, native_path, path):
-    path(native_path)
-    rng = torch.Generator().manual_seed(0)
-    sources = torch.rand(400, dim, generator=rng, dtype=dtype) * torch.arange(1, dim + 1)
-    clusters = cluster_points(in_morton_order(sources)[0], 20, rng)
-    points = 8 * torch.rand(20_000, dim, generator=rng, dtype=dtype) - 4
-    inside = explain(points, clusters, 0.01, 3.0, 3.0)[0] < len(clusters)
-    possible = inside_candidates(points, clusters, 0.01, 3.0)
-    assert torch.equal(points[inside], possible[torch.isin(possible[:, 0], points[inside, 0])])
-    assert 50 < inside.sum() <= len(possible)
-    if native_path:
-        assert len(possible) < 8 * inside.sum()
-    moments = (clusters.counts, clusters.means, clusters.scatters)
-    assert len(inside_candidates(points, Clusters(*(t[:0] for t in moments)), 0.01, 3.0)) == 0
-    assert len(inside_candidates(points[:0], clusters, 0.01, 3.0)) == 0
+    points = torch.randn(6000, dim, generator=rng, dtype=dtype)
+    points = torch.cat([points, points[:500]])  # repeated
+    owners = torch.randint(-1, 42, (6500,), generator=rng)  # 40 and 41 are no clusters
+    owners[(owners > 5) & (owners < 20)] = 3  # a crowded cluster, and empty ones
+    fast = keep_points(points, owners, 40)
+    monkeypatch.setattr(native, "supports", lambda points: False)
+    assert torch.equal(fast, keep_points(points, owners, 40))
+    assert torch.equal(keep_points(points[:0], owners[:0], 3), fast[:3].fill_(torch.inf))
 
 
 def test_owners_of_other_points_are_refused(ops):
-    points, kept = torch.zeros(5, 3), torch.ones(2, dtype=torch.bool)
-    with pytest.raises(RuntimeError, match="one a point"):
-        unexplained(points, torch.zeros(4, dtype=torch.int32), kept)
+    with pytest.raises(RuntimeError, match="one per point"):
+        keep_points(torch.zeros(5, 3), torch.zeros(4, dtype=torch.int32), 2)
 
 
 def test_a_covariance_that_is_none_is_refused(ops):
     clusters = Clusters(torch.tensor([9]), torch.zeros(1, 3), -torch.eye(3)[None])
     with pytest.raises(RuntimeError, match="not positive definite"):
-        explain(torch.zeros(5, 3), clusters, 0.01, 1.0, 2.0)
+        nearest_clusters(torch.zeros(5, 3), clusters, 0.01, 2.0)
 
 
 @dims
@@ -166,9 +129,8 @@ def test_native_pooling_equals_the_plain_one(ops, dtype, dim, monkeypatch):
     )
     raw = raw_factors(factor_covariances(known.covariances, 0.01))
     raw += 0.1 * torch.randn(raw.shape, generator=rng, dtype=dtype).tril()  # tuned
-    moments = (known.counts, known.means, known.scatters)
     kinds = torch.ones(size, dtype=torch.bool)
-    state = MapState(known.means[:, 0], known.means + 1, raw, kinds, *moments)
+    state = replace(new_rows(known, kinds, 0.01), centers=known.means + 1, raw_scale_tril=raw)
     where = torch.arange(size)
     fast = pool_into(state, where, found, 0.01)
     monkeypatch.setattr(native, "supports", lambda points: False)
@@ -184,10 +146,9 @@ def test_opcheck_accepts_the_operators_of_an_update(ops):
     index = ops.build_index(centers, 5)
     counts, scatters = torch.full((12,), 9), torch.eye(3).double().repeat(12, 1, 1)
     moments = (counts, centers, scatters)
-    torch.library.opcheck(ops.explain.default, (points, *moments, 0.01, 1.0, 2.0))
-    owners, kept = torch.arange(40, dtype=torch.int32) % 13, counts < 0
-    torch.library.opcheck(ops.possibly_inside.default, (points, *moments, 0.01, 1.0))
-    torch.library.opcheck(ops.unexplained.default, (points, owners, kept))
+    torch.library.opcheck(ops.nearest_clusters.default, (points, *moments, 0.01, 2.0))
+    owners = torch.arange(40, dtype=torch.int32) % 13
+    torch.library.opcheck(ops.keep_points.default, (points, owners, 12, 32))
     torch.library.opcheck(ops.reaching.default, (centers, raw, points, 2.0, *kernel(5)[1:]))
     given = (points, order, centers, raw, index, *kernel(5))
     torch.library.opcheck(ops.ordered_features.default, given)

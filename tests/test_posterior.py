@@ -164,18 +164,6 @@ def test_the_posterior_is_saved_and_loaded(tmp_path):
     assert torch.equal(again.variance(points), model.variance(points))
 
 
-def test_maps_from_before_uncertainty_still_load(tmp_path):
-    model, points, _ = doubting_map()
-    state = model.state_dict()
-    for name in ("posterior_means", "posterior_variances", "posterior_scales"):
-        del state[name]
-    torch.save(state, tmp_path / "old.pt")
-    old = LardHilbertMap.load(tmp_path / "old.pt")
-    assert torch.equal(old(points), model(points))
-    with pytest.raises(RuntimeError, match="call fit_uncertainty"):
-        old.variance(points)
-
-
 def test_a_new_fit_forgets_the_posterior():
     model, points, labels = doubting_map()
     with pytest.raises(RuntimeError, match="call fit_uncertainty"):

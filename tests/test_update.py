@@ -1,11 +1,11 @@
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_maps import same_map, wall, wall_map
-from test_clustering import cluster_moments
 
 from lardhm_torch import (
     LardHilbertMap,
@@ -15,20 +15,18 @@ from lardhm_torch import (
     sample_rays,
     split_rays,
 )
-from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.cluster_matching import match_clusters, merge_clusters
 from lardhm_torch.learning.clustering import cluster_points
-from lardhm_torch.learning.map_state import MapState, factor_covariances
-from lardhm_torch.learning.replay import contradicted, decay_evidence, hit_clusters
+from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
+from lardhm_torch.learning.forgetting import contradicted, doubted, forget
+from lardhm_torch.learning.map_state import factor_covariances, new_rows
 
 F64 = torch.float64
-PAPER = UpdateConfig(as_in_paper=True, replay=0)
+PAPER = UpdateConfig(as_in_paper=True)
 
 
 def state_of(clusters, is_occupied):
-    raw = raw_factors(factor_covariances(clusters.covariances, 0.01))
-    moments = (clusters.counts, clusters.means, clusters.scatters)
-    return MapState(clusters.means[:, 0] * 0, clusters.means, raw, is_occupied, *moments)
+    return new_rows(clusters, is_occupied, 0.01)
 
 
 # --- laws ---
@@ -48,28 +46,37 @@ def test_an_update_with_no_points_is_the_identity(model):
 
 
 @settings(deadline=None, max_examples=20)
-@given(seed=st.integers(0, 2**31 - 1))
-def test_points_that_are_explained_are_pooled_to_the_statistics_of_the_union(seed):
+@given(seed=st.integers(0, 2**31 - 1), parts=st.integers(1, 5))
+def test_evidence_does_not_depend_on_order_parts_or_repetitions(seed, parts):
     rng = torch.Generator().manual_seed(seed)
-    place = torch.arange(4.0, dtype=F64)[:, None] * torch.tensor([10.0, 0, 0], dtype=F64)
-    first, second = (
-        (place[:, None] + torch.rand(4, 50, 3, generator=rng, dtype=F64)).reshape(-1, 3)
-        for _ in range(2)
-    )
-    labels = torch.ones(200)
-    config = UpdateConfig(refine=1e9, radius=1e3, reach=1e3)
-    model = LardHilbertMap().double().fit(first, labels, num_clusters=4, seed=seed)
-    assume((model.counts == 50).all())  # one cluster for each place: whose a point is, is plain
-    model.update(first.clone(), labels, config=config).update(second, labels, config=config)
-    union = torch.cat([first, first, second]) - model.origin
-    owner = (union[:, None] - model.means[None]).square().sum(2).argmin(1)
-    expected = cluster_moments(union, owner, len(model))
-    torch.testing.assert_close(model.counts, expected.counts)
-    torch.testing.assert_close(model.means, expected.means)
-    torch.testing.assert_close(model.scatters, expected.scatters)
-    torch.testing.assert_close(model.centers, expected.means)
-    factors = raw_factors(factor_covariances(expected.covariances, model.min_lengthscale))
-    torch.testing.assert_close(model.raw_scale_tril, factors)
+    points = torch.randn(400, 3, generator=rng)
+    owners = torch.randint(6, (400,), generator=rng)
+    whole = keep_points(points, owners, 6)
+    kept, of_kept = points[:0], owners[:0]
+    for rows in torch.randperm(400, generator=rng).chunk(parts):
+        more = torch.cat([rows, rows[:30]])
+        found = keep_points(torch.cat([kept, points[more]]), torch.cat([of_kept, owners[more]]), 6)
+        inside = found[:, :, 0].isfinite()
+        kept, of_kept = found[inside], inside.nonzero()[:, 0]
+    assert torch.equal(found, whole)
+    assert torch.equal(kept_counts(whole), owners.bincount(minlength=6).clamp(max=EVIDENCE))
+
+
+def test_clusters_are_those_of_points_that_were_seen_and_nearly_all_are_counted():
+    model, seen = LardHilbertMap().double(), []
+    for seed in range(4):
+        points, labels = wall(seed=seed)
+        seen.append(points)
+        model.update(points, labels, seed=seed)
+    kept = (model.evidence[model.evidence.isfinite().all(dim=2)] + model.origin).float()
+    everything = torch.cat(seen).float()
+    assert torch.isin(kept[:, 1], everything[:, 1]).all()
+    assert 0.95 < int(model.counts[model.is_occupied].sum()) / (4 * 600) <= 1
+    moments = evidence_moments(model.evidence)
+    torch.testing.assert_close(model.means, moments.means)
+    changed = model.counts > 1
+    covariances = model.scatters / (model.counts - 1).clamp(min=1)[:, None, None]
+    torch.testing.assert_close(covariances[changed], moments.covariances[changed])
 
 
 def brute_force_match(known, new, is_occupied, zeta, floor):
@@ -250,7 +257,7 @@ def test_weight_decay_moves_the_weights_alone():
     assert torch.equal(model.raw_scale_tril, before.raw_scale_tril)
 
 
-@pytest.mark.parametrize("room", ["cluster_points", "learn"])
+@pytest.mark.parametrize("room", ["regrouped", "retrained"])
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
 def test_an_update_that_fails_or_is_interrupted_leaves_the_map_as_it_was(monkeypatch, room, error):
     def fail(*_):
@@ -306,10 +313,9 @@ def test_bad_samples_are_refused_and_the_map_is_as_it_was(points, labels, messag
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"radius": 5.0}, "0 < radius <= reach; got 5.0 and 4.0"),
-        ({"zeta": 0.0}, "zeta, refine and memory must be > 0"),
-        ({"crowded": 1.0}, "crowded must be 2 or more; got 1.0"),
-        ({"max_points": 0}, "max_points must be 1 or more and replay 0 or more; got 0"),
+        ({"zeta": 0.0}, "zeta must be > 0; got 0.0"),
+        ({"split_loss": -1.0}, "split_loss must be > 0; got -1.0"),
+        ({"max_points": 0}, "max_points must be > 0; got 0"),
     ],
 )
 def test_settings_are_checked_when_made(settings, message):
@@ -379,14 +385,16 @@ def test_an_obstacle_that_rays_pass_through_fades_within_a_few_scans():
 
 
 def test_a_contradicted_cluster_forgets_most_of_its_past_and_keeps_its_shape():
-    points = wall()[0]
-    clusters = cluster_points(points[:600], 4, torch.Generator().manual_seed(0))
-    part = state_of(clusters, torch.ones(len(clusters), dtype=torch.bool))
-    bound = torch.full_like(part.weights, torch.inf)
-    bound[0] = 0.5
-    after = decay_evidence(part, bound, memory=80.0)
+    points = wall()[0][:600]
+    clusters = cluster_points(points, 4, torch.Generator().manual_seed(0))
+    owners = torch.cdist(points, clusters.means).argmin(dim=1)
+    evidence = keep_points(points, owners, len(clusters))
+    part = new_rows(clusters, torch.ones(len(clusters), dtype=torch.bool), 0.01, evidence)
+    after = forget(part, torch.arange(len(clusters)) == 0)
     assert torch.equal(after.counts[1:], part.counts[1:])
-    assert after.counts[0] == 20
+    assert after.counts[0] == (part.counts[0] + 3) // 4
+    assert torch.equal(after.evidence[0, :8], part.evidence[0, :8])
+    assert kept_counts(after.evidence)[0] == 8
     torch.testing.assert_close(after.clusters.covariances, part.clusters.covariances)
 
 
@@ -395,14 +403,19 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     rng = torch.Generator().manual_seed(0)
     clusters = cluster_points(points[:600], 8, rng)
     known = state_of(clusters, torch.arange(len(clusters)) % 2 > 0)
+    kernel = LardHilbertMap().kernel
     hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
-    passed = contradicted(known, hit_clusters(known, hits, 0.01), len(hits), free, 0.01)
-    assert torch.equal(passed.isfinite(), known.is_occupied)
-    met = hit_clusters(known, free, 0.01)
-    assert torch.equal(met, known.is_occupied)
-    assert not contradicted(known, met, len(free), free, 0.01).isfinite().any()
-    no_hits = hit_clusters(known, hits[:0], 0.01)
-    assert not contradicted(known, no_hits, 0, free, 0.01).isfinite().any()
+    both, labels = torch.cat([hits, free]), torch.tensor([1.0, 0.0]).repeat_interleave(600)
+    passed = forgetting_state(known, both, labels, kernel)
+    assert torch.equal(contradicted(passed), known.is_occupied)
+    hit_again = forgetting_state(passed, free, torch.ones(600), kernel)
+    assert not contradicted(hit_again).any()
+    nothing_there = forgetting_state(known, hits, torch.zeros(600), kernel)
+    assert not contradicted(nothing_there).any()
+
+
+def forgetting_state(known, points, labels, kernel):
+    return replace(known, doubts=doubted(known, points, labels, kernel))
 
 
 # --- real scans ---
@@ -445,14 +458,29 @@ def test_revisits_hardly_grow_the_map(data, name):
 
 
 def test_scans_that_each_see_a_little_more_make_finer_clusters():
-    """A robot that comes nearer sees a wall with a few more points each time, never with many more."""
+    """A robot that comes nearer sees a wavy wall with a few more points each time."""
+    model, rng = LardHilbertMap(), torch.Generator().manual_seed(0)
+    sizes = []
+    for turn in range(12):
+        points = 8 * torch.rand(2, int(200 * 1.2**turn), 3, generator=rng, dtype=F64)
+        points[..., 2] = 0.2 * torch.sin(4 * points[..., 0])
+        points[1, :, 2] -= 0.3  # free space before the wall
+        labels = torch.tensor([1.0, 0.0]).repeat_interleave(points.shape[1])
+        sizes.append(len(model.update(points.reshape(-1, 3), labels, seed=turn)))
+    assert sizes[-1] > 3 * sizes[0]
 
-    def clusters_after(config):
-        model, rng = LardHilbertMap(), torch.Generator().manual_seed(0)
-        for turn in range(18):
-            wall = torch.rand(int(200 * 1.2**turn), 3, generator=rng, dtype=torch.float64)
-            points = wall * torch.tensor([8.0, 8.0, 0.02])
-            model.update(points, torch.ones(len(points)), seed=turn, config=config)
-        return len(model)
 
-    assert clusters_after(UpdateConfig()) > 3 * clusters_after(UpdateConfig(crowded=1e9))
+def test_a_map_saved_without_its_evidence_is_small_and_learns_on(tmp_path):
+    whole = wall_map()
+    whole.save(tmp_path / "whole.pt")
+    whole.save(tmp_path / "small.pt", evidence=False)
+    assert (tmp_path / "small.pt").stat().st_size < 0.5 * (tmp_path / "whole.pt").stat().st_size
+    small = LardHilbertMap.load(tmp_path / "small.pt")
+    points, labels = wall(seed=9)
+    assert torch.equal(small(points), whole(points))
+    for seed in range(3):
+        small.update(*wall(seed=20 + seed, at=6.0), seed=seed)
+        small.update(*wall(seed=30 + seed), seed=seed)
+    for at in (1.0, 6.0):
+        points, labels = wall(seed=5, at=at)
+        assert ((small(points) > 0.5) == (labels > 0.5)).double().mean() > 0.95

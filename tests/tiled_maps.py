@@ -6,7 +6,8 @@ import torch
 
 from lardhm_torch import LardHilbertMap, TiledMap
 from lardhm_torch.features import raw_factors
-from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.clustering import Clusters
+from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.learning.parameters import assign_state
 from lardhm_torch.tiles import layout
 from lardhm_torch.tiles.entries import tile_record
@@ -32,8 +33,9 @@ def random_map(seed=0, dim=3, dtype=F64, clusters=400, extent=20.0):
     counts = torch.randint(1, 50, (clusters,), generator=rng)
     scatters = counts[:, None, None] * factors @ factors.mT
     model = LardHilbertMap(dim, num_neighbors=6).to(dtype)
-    state = (weights, centers, raw_factors(factors), weights > 0, counts, centers, scatters)
-    assign_state(model, MapState(*state))
+    rows = new_rows(Clusters(counts, centers, scatters), weights > 0, 0.01)
+    raw = raw_factors(factors)
+    assign_state(model, replace(rows, weights=weights, raw_scale_tril=raw))
     model.origin = torch.full((dim,), 100.0, dtype=F64)
     return model
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lardhm_torch import features, native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.clustering import Clusters, clusters_from_moments, points_where
+from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.map_state import factor_covariances
 
 
@@ -35,77 +35,25 @@ def kernels_near(
     return ((centers + half_width >= lower) & (centers - half_width <= upper)).all(dim=1)
 
 
-def explain(
-    points: Tensor, clusters: Clusters, floor: float, radius: float, reach: float
-) -> tuple[Tensor, Clusters]:
-    """Assign every point to the cluster with the nearest mean, if it is within the given radii.
-
-    The radii are Mahalanobis distances, in standard deviations of the cluster.
-
-    Args:
-        points: (N, D) positions [m].
-        clusters: M clusters, at least one.
-        floor: smallest standard deviation [m], see `map_state.factor_covariances`.
-        radius: points within it join the cluster.
-        reach: points within it are owned by the cluster; at least ``radius``.
-
-    Returns:
-        (N,) int owner of each point, M for points without an owner; and the moments of the points
-        that join each cluster, accumulated in float64. A cluster that no point joins has count 0,
-        its own mean and scatter 0.
-    """
-    if native.supports(points):
-        rule = (floor, radius, reach)
-        owners, *moments = torch.ops.lardhm.explain(points.detach(), *clusters, *rule)
-        return owners, Clusters(*moments)
-    centers, factors = clusters.means, factor_covariances(clusters.covariances, floor)
-    count, dim = centers.shape
-    owners = torch.full((len(points),), count, device=points.device)
-    moments = [centers.new_zeros(count, *[dim] * power, dtype=torch.float64) for power in range(3)]
-    for rows in torch.arange(len(points), device=points.device).split(features.QUERY_CHUNK):
-        chunk = points[rows]
-        owner = features.nearest_centers(chunk, centers, 1).squeeze(1)
-        offsets = (chunk - centers[owner])[:, :, None]
-        whitened = torch.linalg.solve_triangular(factors[owner], offsets, upper=False)
-        squared = whitened.square().sum(dim=(1, 2))
-        owners[rows[squared <= reach**2]] = owner[squared <= reach**2]
-        joins = squared <= radius**2
-        owner, offset = owner[joins], offsets[joins, :, 0].double()
-        moments[0].index_add_(0, owner, torch.ones_like(offset[:, 0]))
-        moments[1].index_add_(0, owner, offset)
-        moments[2].index_add_(0, owner, offset[:, :, None] * offset[:, None])
-    found = clusters_from_moments(centers.double(), *moments)
-    return owners, Clusters(found.counts, found.means.to(centers), found.scatters.to(centers))
-
-
-def inside_candidates(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
-    """(P, D) candidate points that may lie inside some cluster, in order.
-
-    This fast prefilter keeps all points that lie inside a cluster, and possibly others.
+def nearest_clusters(points: Tensor, clusters: Clusters, floor: float, radius: float) -> Tensor:
+    """(N,) the cluster with the nearest mean, or -1 if the point is not within ``radius``.
 
     Args:
         points: (N, D) positions [m].
         clusters: M clusters.
         floor: smallest standard deviation [m], see `map_state.factor_covariances`.
-        radius: points within this Mahalanobis distance are inside.
+        radius: Mahalanobis distance, in standard deviations of the cluster.
     """
+    count = len(clusters)
+    if count == 0 or len(points) == 0:
+        return torch.full((len(points),), -1, device=points.device)
     if native.supports(points):
-        return torch.ops.lardhm.possibly_inside(points.detach(), *clusters, floor, radius)
-    return points if len(clusters) else points[:0]
-
-
-def unexplained(points: Tensor, owners: Tensor, kept: Tensor) -> Tensor:
-    """(R, D) points that are not owned by a kept cluster, in order.
-
-    Args:
-        points: (N, D) positions [m].
-        owners: (N,) owners returned by `explain`.
-        kept: (M,) bool, clusters that keep their points.
-    """
-    if native.supports(points):
-        return torch.ops.lardhm.unexplained(points.detach(), owners, kept)
-    left_out = torch.cat([~kept, kept.new_ones(1)])
-    return points_where(points, left_out.index_select(0, owners))
+        return torch.ops.lardhm.nearest_clusters(points.detach(), *clusters, floor, radius).long()
+    centers, factors = clusters.means, factor_covariances(clusters.covariances, floor)
+    owners = features.nearest_centers(points, centers, 1).squeeze(1)
+    offsets = (points - centers[owners])[:, :, None]
+    whitened = torch.linalg.solve_triangular(factors[owners], offsets, upper=False)
+    return torch.where(whitened.square().sum(dim=(1, 2)) <= radius**2, owners, -1)
 
 
 def ordered_features(

@@ -89,10 +89,10 @@ def cluster_points(
 
 def most_clusters(num_points: int) -> int:
     """Maximum number of clusters of a class: one per `MIN_COUNT` points, or per point if few."""
-    return max(num_points // MIN_COUNT, _max_singletons(num_points))
+    return max(num_points // MIN_COUNT, max_singletons(num_points))
 
 
-def _max_singletons(num_points: int) -> int:
+def max_singletons(num_points: int) -> int:
     """Number of clusters that may be smaller than `MIN_COUNT`; 0 from 2 `FEW_POINTS` points on."""
     return max(0, min(num_points, 2 * FEW_POINTS - num_points))
 
@@ -236,7 +236,7 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
     strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
     # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
     count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
-    few = min(count, _max_singletons(len(points)))
+    few = min(count, max_singletons(len(points)))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
     finest = max(len(points) // POINTS_PER_CLUSTER, few)
     coarsest = len(points) // DENSE_POINTS

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.clustering import cluster_classes
+from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.unseen import settle_unknown
 
@@ -94,6 +95,7 @@ def fit_clusters(
     """
     clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
+    state = replace(state, evidence=fitted_evidence(points, labels, state, task.rng))
     columns = settle_unknown(points, labels, state, task.kernel, task.rng)
     batch_size = task.config.rows_per_batch(len(columns[0]))
     points, labels = stratified_batches(columns, batch_size, task.rng)

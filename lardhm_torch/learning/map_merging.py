@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TypeVar
 
@@ -10,19 +11,20 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import Kernel, raw_factors
+from lardhm_torch.features import Kernel, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
-from lardhm_torch.learning.fitting import FitConfig
+from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
+from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
-from lardhm_torch.learning.replay import Evidence, join_evidence, learn, replay_evidence
+from lardhm_torch.learning.retraining import balanced, evidence_weights, trained
 from lardhm_torch.sampling import seeded_generator
 
 AnyMap = TypeVar("AnyMap", bound=MapParameters)
 
 ZETA = 1.0  # [m] maximum distance of matching clusters (zeta in Algorithm 2)
-SAMPLES_PER_CLUSTER = 16  # number of pseudo-samples per cluster
+REACHED = 1e-3  # feature of a free cluster above which it reaches a position
 TOLERANCE = 0.01  # accepted change of a probability by merging
 
 
@@ -73,6 +75,9 @@ def moved(
         centers=transformed(state.centers),
         raw_scale_tril=_rotated_factors(state.raw_scale_tril, rotation),
         means=transformed(state.means),
+        evidence=transformed(state.evidence.nan_to_num(posinf=0)).where(
+            state.evidence.isfinite(), torch.inf
+        ),
         scatters=scatters.to(state.scatters.dtype),
     )
     return after, new_origin
@@ -101,9 +106,34 @@ def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
     return center
 
 
-def within(state: MapState, center: Tensor, radius: float) -> MapState:
-    """The clusters whose centers are within ``radius`` [m] of a position in the map frame."""
-    return state.rows(torch.linalg.vector_norm(state.centers - center, dim=1) <= radius)
+def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> MapState:
+    """The clusters within ``radius`` [m] of a position in the map frame, and those that bound them.
+
+    Kernels of free clusters extend beyond the sphere. Clusters outside that are not free and that such
+    a kernel reaches are kept, so that walls outside the sphere do not become free space.
+    """
+    kept = torch.linalg.vector_norm(state.centers - center, dim=1) <= radius
+    inside = state.rows(kept)
+    outside = (~kept & (state.kinds != 1)).nonzero().squeeze(1)
+    if len(inside) == 0 or len(outside) == 0:
+        return inside
+    free = inside.rows(inside.kinds == 1)
+    reached = torch.zeros_like(outside, dtype=torch.bool)
+    for means in (state.means[outside], *_surroundings(state.rows(outside), kernel)):
+        if len(free):
+            indices = native.nearest_centers(means, free.centers, kernel.num_neighbors)
+            factors = kernel_factors(free.raw_scale_tril, kernel)
+            values = lard_kernel(means, free.centers, factors, indices)
+            reached |= (values > REACHED).any(dim=1)
+    return state.rows(kept.index_fill(0, outside[reached], True))
+
+
+def _surroundings(state: MapState, kernel: Kernel) -> Iterator[Tensor]:
+    """(M, D) positions one standard deviation from the means, in both directions of every axis."""
+    factors = factor_covariances(state.clusters.covariances, kernel.min_lengthscale)
+    for axis in range(factors.shape[1]):
+        yield state.means + factors[:, :, axis]
+        yield state.means - factors[:, :, axis]
 
 
 def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
@@ -143,7 +173,12 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         return joined
     shift = (second.origin - first.origin).to(ours.means)
     theirs = MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True)))
-    theirs = replace(theirs, centers=theirs.centers + shift, means=theirs.means + shift)
+    theirs = replace(
+        theirs,
+        centers=theirs.centers + shift,
+        means=theirs.means + shift,
+        evidence=theirs.evidence + shift,
+    )
     rng = seeded_generator(seed, "merge_maps", shift.device)
     pooled = _pooled(ours, theirs, first.kernel)
     write_state(joined, _retrained(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
@@ -185,34 +220,48 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
         pooled.counts,
         pooled.means,
         pooled.scatters,
+        _pooled_evidence(before, others, rows),
+        torch.zeros_like(before.losses),
+        before.doubts,
+        before.fresh,
     )
     rest = theirs.rows(~is_matched)
     tail = MapState(*(torch.cat(pair) for pair in zip(after, rest, strict=True)))
     return ours.put(where, tail)
 
 
+def _pooled_evidence(first: MapState, second: MapState, rows: Tensor) -> Tensor:
+    """Evidence of merged clusters, from that of all clusters and the merged row of each."""
+    points, owners = kept_points(torch.cat([first.evidence, second.evidence]))
+    return keep_points(points, rows[owners], len(first))
+
+
 def _retrained(
     joined: MapState, ours: MapState, theirs: MapState, kernel: Kernel, rng: torch.Generator
 ) -> MapState:
     """Retrain the weights of the merged map where it deviates from the original maps."""
-    evidence = join_evidence([_map_evidence(state, kernel, rng) for state in (ours, theirs)])
+    parts = [_map_samples(state, kernel, rng) for state in (ours, theirs)]
+    points, labels, kinds, strength = map(torch.cat, zip(*parts, strict=True))
     tensors = (joined.centers, joined.raw_scale_tril, joined.weights, kernel)
     index = native.build_index(joined.centers, kernel.num_neighbors)
-    probability = native.occupancy(evidence.points, *tensors, probability=True, index=index)
-    contested = (probability - evidence.labels).abs() > TOLERANCE
+    probability = native.occupancy(points, *tensors, probability=True, index=index)
+    contested = (probability - labels).abs() > TOLERANCE
     if not bool(contested.any()):
         return joined
-    near = native.nearest_centers(
-        evidence.points[contested], joined.centers, kernel.num_neighbors, index
-    )
+    near = native.nearest_centers(points[contested], joined.centers, kernel.num_neighbors, index)
     open_rows = torch.zeros_like(joined.is_occupied).index_fill_(0, near.reshape(-1), True)
-    learned = learn(joined, evidence, kernel, index, FitConfig(l2=0.01), rng)
+    config = FitConfig(l2=0.01)
+    samples = (points, labels, balanced(kinds, strength, config))
+    learned, _ = trained(joined, index, samples, FitTask(kernel, config, rng))
     return replace(joined, weights=torch.where(open_rows, learned, joined.weights))
 
 
-def _map_evidence(state: MapState, kernel: Kernel, rng: torch.Generator) -> Evidence:
-    """Pseudo-samples of a complete map, weighted by the number of points of each cluster."""
-    rows = torch.arange(len(state), device=state.weights.device)
-    strength = (state.counts / SAMPLES_PER_CLUSTER).to(state.weights.dtype)[:, None]
-    strength = strength.expand(-1, SAMPLES_PER_CLUSTER)
-    return replay_evidence(state, rows, kernel, strength, rng)
+def _map_samples(
+    state: MapState, kernel: Kernel, rng: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Kept points of a map; the probability of the map, class and weight of each."""
+    state = replace(state, evidence=with_evidence(state, kernel.min_lengthscale, rng))
+    points, owners = kept_points(state.evidence)
+    tensors = (state.centers, state.raw_scale_tril, state.weights, kernel)
+    labels = native.occupancy(points, *tensors, probability=True)
+    return points, labels, state.kinds[owners], evidence_weights(state)[owners]

@@ -10,10 +10,17 @@ from torch import Tensor
 from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.clustering import Clusters, Columns
 
+EVIDENCE = 32  # E, number of points that a cluster keeps
+
 
 @dataclass(frozen=True, eq=False)
 class MapState(Columns):
-    """All tensors of a map except its origin, with M rows each (see `LardHilbertMap`)."""
+    """All tensors of a map except its origin, with M rows each (see `LardHilbertMap`).
+
+    ``evidence`` is (M, E, D), see `evidence`. ``losses`` is (M,): the mean loss of the points that a
+    cluster keeps, 0 if it has not been computed. ``doubts`` is (M,), see `forgetting`.
+    ``fresh`` is (M,): the number of kept points that the weights have not been trained on.
+    """
 
     weights: Tensor
     centers: Tensor
@@ -22,6 +29,10 @@ class MapState(Columns):
     counts: Tensor
     means: Tensor
     scatters: Tensor
+    evidence: Tensor
+    losses: Tensor
+    doubts: Tensor
+    fresh: Tensor
 
     def rows(self, which: Tensor) -> MapState:
         """Copies of the clusters selected by a mask or by indices, in that order."""
@@ -43,22 +54,39 @@ class MapState(Columns):
         return self.weights.shape[0]
 
     @property
+    def kinds(self) -> Tensor:
+        """(M,) class of each cluster: 0 occupied, 1 free, 2 unknown (`unknown_clusters`)."""
+        return torch.where(self.is_occupied, 0, torch.where(self.counts > 0, 1, 2))
+
+    @property
     def clusters(self) -> Clusters:
         """The moments of the clusters."""
         return Clusters(self.counts, self.means, self.scatters)
 
 
-def new_rows(clusters: Clusters, is_occupied: Tensor, floor: float) -> MapState:
+def new_rows(
+    clusters: Clusters, is_occupied: Tensor, floor: float, evidence: Tensor | None = None
+) -> MapState:
     """Rows of new clusters, with centers and length-scales from their moments and weights of 0.
 
     Args:
         clusters: M clusters.
         is_occupied: (M,) bool, class of each cluster.
         floor: smallest standard deviation [m], see `map_state.factor_covariances`.
+        evidence: (M, E, D) points kept by the clusters [m]; None: no points.
     """
     factors = factor_covariances(clusters.covariances, floor)
     weights = torch.zeros_like(clusters.means[:, 0])
-    return MapState(weights, clusters.means, raw_factors(factors), is_occupied, *clusters)
+    if evidence is None:
+        evidence = no_evidence(clusters.means)
+    raw = raw_factors(factors)
+    history = (evidence, weights.clone(), weights.clone(), weights.clone())
+    return MapState(weights, clusters.means, raw, is_occupied, *clusters, *history)
+
+
+def no_evidence(means: Tensor) -> Tensor:
+    """(M, D) means -> (M, E, D) infinity: clusters that keep no points."""
+    return means.new_full((len(means), EVIDENCE, means.shape[1]), torch.inf)
 
 
 def factor_covariances(covariances: Tensor, floor: float) -> Tensor:

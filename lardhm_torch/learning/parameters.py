@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.map_state import EVIDENCE, MapState
 
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
+HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
 SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
 
 
@@ -30,6 +31,10 @@ class MapParameters(nn.Module):
     counts: Tensor
     means: Tensor
     scatters: Tensor
+    evidence: Tensor
+    losses: Tensor
+    doubts: Tensor
+    fresh: Tensor
     posterior_means: Tensor
     posterior_variances: Tensor
     posterior_scales: Tensor
@@ -76,6 +81,10 @@ class MapParameters(nn.Module):
             "counts": weights.new_zeros(0, dtype=torch.long),
             "means": weights.new_zeros(0, dim),
             "scatters": weights.new_zeros(0, dim, dim),
+            "evidence": weights.new_zeros(0, EVIDENCE, dim),
+            "losses": weights.new_zeros(0),
+            "doubts": weights.new_zeros(0),
+            "fresh": weights.new_zeros(0),
             "posterior_means": weights.new_zeros(0),
             "posterior_variances": weights.new_zeros(0),
             "posterior_scales": weights.new_ones(2),
@@ -209,7 +218,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
             f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
             "LardHilbertMap.load"
         )
-    _fill_posterior(state, prefix)
+    _fill_evidence(state, prefix)
     own = dict(model.state_tensors())
     missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
     if missing:
@@ -225,13 +234,14 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
     resize(model, num_clusters)
 
 
-def _fill_posterior(state: dict[str, Any], prefix: str) -> None:
-    """Add an empty posterior to state dicts of format versions without one."""
-    weights = state.get(prefix + "weights")
-    if isinstance(weights, Tensor):
-        for name in ("posterior_means", "posterior_variances"):
-            state.setdefault(prefix + name, torch.zeros_like(weights))
-        state.setdefault(prefix + "posterior_scales", torch.ones(2, dtype=weights.dtype))
+def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
+    """Add empty evidence to the state dict of a map that was saved without it."""
+    centers = state.get(prefix + "centers")
+    if isinstance(centers, Tensor) and centers.ndim == 2:
+        shape = (len(centers), EVIDENCE, centers.shape[1])
+        state.setdefault(prefix + "evidence", centers.new_full(shape, torch.inf))
+        for name in ("losses", "doubts", "fresh"):
+            state.setdefault(prefix + name, centers.new_zeros(shape[:1]))
 
 
 def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
@@ -265,23 +275,33 @@ def write_state(model: MapParameters, state: MapState, origin: Tensor) -> None:
     model.origin = origin
 
 
-def write_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
-    """Overwrite rows of a map and append new ones. If anything fails, the map is unchanged.
+def write_rows(model: MapParameters, where: Tensor, part: MapState, removed: Tensor) -> None:
+    """Overwrite rows of a map, append new ones, and remove others. If it fails, nothing changes.
 
-    The cost depends on the number of changed rows, not on the size of the map.
+    The cost depends on the number of changed rows, not on the size of the map. The last rows of the
+    map take the places of removed ones.
 
     Args:
         model: a map of M clusters.
         where: (Q,) rows to overwrite.
         part: Q rows to write there, followed by the clusters to append.
+        removed: (R,) rows to remove; clusters are only appended if R = 0.
     """
-    size, before = len(model), read_state(model).rows(where)
+    size = len(model)
+    left = size + len(part) - len(where) - len(removed)
+    tail = torch.arange(left, max(left, size), device=removed.device)
+    holes = removed[removed < left]
+    touched = torch.cat([where, holes, tail])
+    before = read_state(model).rows(touched)
     try:
         resize(model, size + len(part) - len(where), keep=True)
         assign_rows(model, where, part)
+        if len(removed):
+            assign_rows(model, holes, read_state(model).rows(tail[~torch.isin(tail, removed)]))
+            resize(model, left, keep=True)
     except BaseException:
         resize(model, size, keep=True)
-        assign_rows(model, where, before)
+        assign_rows(model, touched, before)
         raise
     model.posterior_variances.zero_()
 

@@ -1,9 +1,9 @@
-"""Incremental update with one more scan: Algorithm 2, and a default rule with bounded growth.
+"""Incremental update with one more scan: evidence, regrouping, and training where it changed.
 
-Algorithm 2 clusters the new points and merges new clusters with old ones. Two independent partitions
-of a surface rarely have centers within one standard deviation of each other, so the map grows with
-every scan of the same place. By default, new points are therefore assigned directly to nearby clusters
-of their class, and only the remaining points are clustered.
+A map keeps a bounded sample of the real points of each cluster (`evidence`). An update adds the points
+of a scan to it, drops what they contradict (`forgetting`), groups the changed points anew
+(`regrouping`) and trains the weights there on kept points with their labels (`retraining`). So the map
+is always trained on a sample of all that was seen. Algorithm 2 as printed is available, too.
 """
 
 from __future__ import annotations
@@ -16,80 +16,44 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.assignment import explain, kernels_near, unexplained
-from lardhm_torch.learning.cluster_matching import (
-    append_clusters,
-    merge_clusters,
-    pool_into,
-    take_clusters,
-    whitened,
-)
+from lardhm_torch.learning.assignment import kernels_near
+from lardhm_torch.learning.cluster_matching import merge_clusters
 from lardhm_torch.learning.clustering import (
-    MIN_COUNT,
-    Clusters,
+    FEW_POINTS,
+    MAX_CHOSEN,
+    POINTS_PER_CLUSTER,
     cluster_classes,
-    cluster_points,
-    scan_clusters,
-    split_classes,
-    split_clusters,
+    split_labels,
+    spread_rows,
 )
-from lardhm_torch.learning.fitting import FitConfig
+from lardhm_torch.learning.evidence import kept_counts, with_evidence
+from lardhm_torch.learning.fitting import FitConfig, FitTask
+from lardhm_torch.learning.forgetting import contradicted, doubted, forget
 from lardhm_torch.learning.map_state import MapState
-from lardhm_torch.learning.replay import (
-    contradicted,
-    decay_evidence,
-    hit_clusters,
-    join_evidence,
-    learn,
-    neighborhood,
-    new_evidence,
-    replay_evidence,
-    spread_points,
-)
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.regrouping import Rule, regrouped
+from lardhm_torch.learning.retraining import balanced, retrained, trained
+from lardhm_torch.points import UNKNOWN, in_morton_order
 
-COVERED_FRACTION = 0.36  # a scan covers a cluster if its points have this fraction of the variance
-FREE_FACTOR = 2.0  # factor on `UpdateConfig.crowded` for free clusters, which may be coarser
+UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown
 BOX_STDS = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
-CHECKED_POINTS = 4  # number of free points checked for contradictions, relative to max_points
-# Pseudo-samples already contain the class weight of `fit`, so the classes get equal weights here.
-UPDATE_FIT = FitConfig(batch_size=1024, l2=0.01, occupied_share=0.5)
+UPDATE_FIT = FitConfig(passes=4, batch_size=1024)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateConfig:
-    """Settings of an incremental update. Radii are in standard deviations of a cluster."""
+    """Settings of an incremental update."""
 
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
-    radius: float = 3.0  # points within it of the nearest center of their class join the cluster
-    reach: float = 4.0  # only points beyond it form new clusters
-    fringe: float = 2.0  # new clusters with an old center within it are discarded
-    refine: float = 1.3  # clusters whose ratio of new to old points exceeds this are split
-    crowded: float = 8.0  # for that rule, the old count is capped at this times the usual count
-    max_points: int = 20_000  # random points used to train the weights; clusters use all points
-    replay: int = 8  # pseudo-samples per old cluster; 0: train on new points only
-    memory: float = 800.0  # upper bound on the weight of the old points of a cluster
+    split_loss: float = 0.01  # clusters whose points have a larger mean loss are divided
+    max_points: int = 20_000  # new points of each class that are used; more are drawn at random
+    max_trained: int = 4_000  # changed clusters that are trained; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
-        if not 0 < self.radius <= self.reach:
-            raise ValueError(
-                f"radius and reach must satisfy 0 < radius <= reach; got {self.radius} "
-                f"and {self.reach}"
-            )
-        if not (self.zeta > 0 and self.fringe >= 0 and self.refine > 0 and self.memory > 0):
-            raise ValueError(
-                "zeta, refine and memory must be > 0 and fringe 0 or more; got "
-                f"{self.zeta}, {self.refine}, {self.memory} and {self.fringe}"
-            )
-        if not self.crowded >= 2:
-            raise ValueError(f"crowded must be 2 or more; got {self.crowded}")
-        if self.max_points < 1 or self.replay < 0:
-            raise ValueError(
-                "max_points must be 1 or more and replay 0 or more; "
-                f"got {self.max_points} and {self.replay}"
-            )
+        for name in ("zeta", "split_loss", "max_points", "max_trained"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be > 0; got {getattr(self, name)}")
 
 
 class Task(NamedTuple):
@@ -100,9 +64,17 @@ class Task(NamedTuple):
     rng: torch.Generator
 
 
+class Changes(NamedTuple):
+    """Result of an update: rows to overwrite, their clusters and new ones, and rows to remove."""
+
+    where: Tensor
+    part: MapState
+    removed: Tensor
+
+
 def updated(
     state: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
-) -> tuple[Tensor, MapState]:
+) -> Changes:
     """Update clusters and weights with one more scan.
 
     Only clusters near the points are processed, so the cost does not grow with the map. Existing
@@ -111,179 +83,117 @@ def updated(
     Args:
         state: M clusters.
         points: (N, D) new positions, map frame [m].
-        labels: (N,) 1 occupied, 0 free.
-        num_clusters: total over both classes for a scan of an unmapped place; None: chosen from the
-            data.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+        num_clusters: maximum number of clusters near the points, over all classes; None: chosen
+            from the number of hits there.
         task: kernel, settings, random generator.
 
     Returns:
-        (Q,) rows of the clusters near the points; and the updated clusters in that order, followed
-        by the new clusters.
+        The clusters near the points; see `parameters.write_rows`. New clusters take the rows of
+        dissolved ones.
 
     Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
     """
-    near = kernels_near(state.centers, state.raw_scale_tril, task.kernel, points, BOX_STDS)
-    nearby = near.nonzero().squeeze(1)
-    known = state.rows(nearby)
-    classes = split_classes(points, labels > 0.5)
-    if task.config.as_in_paper:
-        points, labels = in_morton_order(points, labels)
-        new, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
-        part = merge_clusters(
-            known, new, is_occupied, task.config.zeta, task.kernel.min_lengthscale
-        )
-        hit = hit_clusters(known, classes[0], task.kernel.min_lengthscale)
-    else:
-        part, hit = _grown(known, classes, num_clusters, task)
-    return nearby, _train(part, known, classes, hit, task)
+    kernel, config, rng = task.kernel, task.config, task.rng
+    nearby = kernels_near(state.centers, state.raw_scale_tril, kernel, points, BOX_STDS)
+    nearby = nearby.nonzero().squeeze(1)
+    part = state.rows(nearby)
+    part = replace(part, evidence=with_evidence(part, kernel.min_lengthscale, rng))
+    if config.as_in_paper:
+        return Changes(nearby, _as_in_paper(part, points, labels, num_clusters, task), nearby[:0])
+    few = int(state.counts[state.is_occupied].sum() + (labels > UNKNOWN).sum()) <= FEW_POINTS
+    points, labels = _thinned(points, labels, config.max_points, rng)
+    points, labels = _still_unknown(part, points, labels, kernel)
+    part = replace(part, doubts=doubted(part, points, labels, kernel))
+    lost = contradicted(part)
+    part = _regrouped(forget(part, lost), points, labels, num_clusters, few, task)
+    alive = kept_counts(part.evidence) > 0
+    part = retrained(part.rows(alive), config.max_trained, kernel, config.fit, rng)
+    return _without(nearby, part, alive)
 
 
-def _grown(
-    known: MapState, classes: list[Tensor], num_clusters: int | None, task: Task
-) -> tuple[MapState, Tensor]:
-    """Known clusters pooled with new points, followed by new clusters; and a mask of those hit."""
-    if num_clusters is None:
-        totals = scan_clusters(classes)
-    else:
-        totals = split_clusters([len(members) for members in classes], num_clusters)
-    part, hit = known, torch.zeros_like(known.is_occupied)
-    for kind, members, total in zip((True, False), classes, totals, strict=True):
-        if total:
-            part, joined = absorb(part, members, kind, total, task)
-            hit = hit.index_fill(0, joined, True) if kind else hit
-    return part, hit
+def _without(nearby: Tensor, part: MapState, alive: Tensor) -> Changes:
+    """Changes of a map whose rows ``nearby`` become the living of as many clusters and new ones.
+
+    Args:
+        nearby: (Q,) rows of known clusters.
+        part: the living clusters, in order.
+        alive: (P,) mask of the living among the known clusters and the new ones after them.
+    """
+    known = alive[: len(nearby)]
+    places = nearby[known]
+    dead = nearby[~known]
+    filled = dead[: max(0, len(part) - len(places))]
+    return Changes(torch.cat([places, filled]), part, dead[len(filled) :])
 
 
-def _train(
-    part: MapState, known: MapState, classes: list[Tensor], hit: Tensor, task: Task
+def _thinned(
+    points: Tensor, labels: Tensor, limit: int, rng: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """At most ``limit`` samples of each label: a stratified random subset of the others."""
+    rows = []
+    for label in (1.0, 0.0, UNKNOWN):
+        own = (labels == label).nonzero().squeeze(1)
+        rows.append(own[spread_rows(len(own), limit, rng)] if len(own) > limit else own)
+    chosen = torch.cat(rows)
+    return points.index_select(0, chosen), labels.index_select(0, chosen)
+
+
+def _still_unknown(
+    part: MapState, points: Tensor, labels: Tensor, kernel: Kernel
+) -> tuple[Tensor, Tensor]:
+    """The samples without unknown points in places that earlier scans observed.
+
+    Unknown points were checked against the rays of their own scan only. They are dropped where the
+    probability of the map is not near 1/2.
+    """
+    rows = (labels == UNKNOWN).nonzero().squeeze(1)
+    if len(rows) == 0 or len(part) == 0:
+        return points, labels
+    tensors = (part.centers, part.raw_scale_tril, part.weights, kernel)
+    probability = native.occupancy(points[rows], *tensors, probability=True)
+    kept = torch.ones_like(labels, dtype=torch.bool)
+    kept[rows] = (probability - UNKNOWN).abs() < UNDECIDED
+    return points[kept], labels[kept]
+
+
+def _regrouped(
+    part: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, few: bool, task: Task
 ) -> MapState:
-    """Train the weights on the new points and on pseudo-samples of nearby clusters.
-
-    Args:
-        part: updated clusters near the scan, followed by new ones.
-        known: Q clusters near the scan, before the update.
-        classes: (N, D) occupied and (F, D) free new points [m].
-        hit: (Q,) bool, known clusters that contain new hits.
-        task: kernel, settings, random generator.
-    """
-    config, kernel, rng = task.config, task.kernel, task.rng
-    index = native.build_index(part.centers, kernel.num_neighbors)
-    new = new_evidence(classes, config.max_points, rng)
-    if not config.replay or len(known) == 0:
-        learned = learn(part, join_evidence(new), kernel, index, config.fit, rng)
-        return replace(part, weights=learned)
-    changed = torch.ones_like(part.is_occupied)
-    changed[: len(known)] = (part.means[: len(known)] != known.means).any(dim=1)
-    moving = neighborhood(changed, part.centers, kernel.num_neighbors, index)
-    rows = moving[: len(known)].nonzero().squeeze(1)
-    num_checked = CHECKED_POINTS * config.max_points
-    passed = spread_points(classes[1], num_checked, rng)
-    bound = contradicted(known, hit, len(classes[0]), passed, kernel.min_lengthscale)
-    strength = known.counts.clamp(max=config.memory).to(bound).minimum(bound)[rows]
-    strength = (strength / config.replay)[:, None].expand(-1, config.replay)
-    old = replay_evidence(known, rows, kernel, strength, rng)
-    learned = learn(part, join_evidence([*new, old]), kernel, index, config.fit, rng)
-    return replace(
-        decay_evidence(part, bound, config.memory),
-        weights=torch.where(moving, learned, part.weights),
-    )
+    """All classes regrouped with their new points."""
+    kinds = part.kinds
+    classes = split_labels(points, labels)
+    limits = _limits(part, classes, num_clusters, few)
+    for kind, (members, limit) in enumerate(zip(classes, limits, strict=True)):
+        own = (kinds == kind).nonzero().squeeze(1)
+        floor = task.kernel.min_lengthscale
+        rule = Rule(kind, max(limit, len(own)), few, task.config.split_loss, floor)
+        if len(own) or len(members):
+            part = part.put(own, regrouped(part.rows(own), members, rule, task.rng))
+    return part
 
 
-def absorb(
-    part: MapState, points: Tensor, is_occupied: bool, num_clusters: int, task: Task
-) -> tuple[MapState, Tensor]:
-    """Assign points of one class to nearby clusters; cluster the remaining points.
+def _limits(
+    part: MapState, classes: list[Tensor], num_clusters: int | None, few: bool
+) -> list[int]:
+    """Maximum number of clusters of each class near a scan."""
+    if num_clusters is None:
+        hits = int(part.counts[part.is_occupied].sum()) + len(classes[0])
+        occupied = min(MAX_CHOSEN, max(hits if few else 1, hits // POINTS_PER_CLUSTER))
+        return [occupied, 2 * occupied, occupied]
+    return [num_clusters // 4, num_clusters // 2, num_clusters // 4]
 
-    Args:
-        part: clusters near the scan, of both classes.
-        points: (N, D) new points of one class [m].
-        is_occupied: class of the points.
-        num_clusters: number of clusters for all points; reduced in proportion to the points that
-            remain.
-        task: kernel, settings, random generator.
 
-    Returns:
-        Updated clusters ``part``, followed by new ones; and the rows of clusters that contain new
-        points.
-    """
+def _as_in_paper(
+    part: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
+) -> MapState:
+    """Algorithm 2: clusters of the new points, merged with known ones and trained on the points."""
+    points, labels = in_morton_order(points, labels)
+    new, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     floor = task.kernel.min_lengthscale
-    own = (part.is_occupied == is_occupied).nonzero().squeeze(1)
-    known = part.rows(own)
-    assignment = _assign(known, points, len(points) / num_clusters, task)
-    pooled = (assignment.found.counts > 0).nonzero().squeeze(1)
-    part = pool_into(part, own[pooled], take_clusters(assignment.found, pooled), floor)
-    joined = torch.cat([own[pooled], own[assignment.too_coarse]])
-    if len(assignment.rest) < MIN_COUNT:
-        return part, joined
-    (rest,) = in_morton_order(assignment.rest)
-    num_new = -(-num_clusters * len(rest) // len(points))
-    new = cluster_points(rest, num_new, task.rng)
-    new, where = _select_new(known, new, assignment, task)
-    kinds = torch.full((len(new),), is_occupied, device=points.device)
-    return append_clusters(part, new, kinds, floor, own[where]), joined
-
-
-class _Assignment(NamedTuple):
-    """Assignment of new points to known clusters.
-
-    ``found`` holds the moments of the points that join each cluster. ``too_coarse`` masks the clusters
-    that are too coarse for the scan, and ``covered`` those of them that the scan covers completely.
-    ``rest`` holds the points of too coarse clusters, and the points without a nearby cluster.
-    """
-
-    rest: Tensor
-    found: Clusters
-    too_coarse: Tensor
-    covered: Tensor
-
-
-def _assign(known: MapState, points: Tensor, usual_count: float, task: Task) -> _Assignment:
-    config, clusters = task.config, known.clusters
-    if len(known) == 0:
-        return _Assignment(points, clusters, known.is_occupied, known.is_occupied)
-    rule = (task.kernel.min_lengthscale, config.radius, config.reach)
-    owners, found = explain(points, clusters, *rule)
-    # Cap the count, so that a cluster that grew over many scans can still be found to be too coarse.
-    most = config.crowded if bool(known.is_occupied[0]) else FREE_FACTOR * config.crowded
-    past = clusters.counts.clamp(2 * usual_count, most * usual_count)
-    too_coarse = found.counts > config.refine * past
-    covered = too_coarse & (_spread(found) > COVERED_FRACTION * _spread(clusters))
-    found = Clusters(found.counts * ~too_coarse, found.means, found.scatters)
-    return _Assignment(unexplained(points, owners, ~too_coarse), found, too_coarse, covered)
-
-
-def _spread(clusters: Clusters) -> Tensor:
-    """(M,) total variance of each cluster [m^2]."""
-    total = clusters.scatters.diagonal(dim1=1, dim2=2).sum(dim=1)
-    return total / clusters.counts.clamp(min=1)
-
-
-def _select_new(
-    known: MapState, new: Clusters, assignment: _Assignment, task: Task
-) -> tuple[Clusters, Tensor]:
-    """Select and order the new clusters, and return the rows that the first of them replace.
-
-    A new cluster close to an old center lies at the boundary of an old cluster and is discarded. The
-    count of a covered cluster is distributed among its new clusters in proportion to their counts,
-    and one of them replaces its row.
-    """
-    none = known.counts[:0]
-    if len(known) == 0:
-        return new, none
-    owner = native.nearest_centers(new.means, known.means, 1).squeeze(1)
-    offsets = known.means[owner] - new.means
-    apart = whitened(offsets, new.covariances, task.kernel.min_lengthscale) > task.config.fringe
-    kept = assignment.too_coarse[owner] | apart
-    new, owner = take_clusters(new, kept), owner[kept]
-    inherits = assignment.covered[owner]
-    total = torch.zeros_like(known.counts).index_add_(0, owner, new.counts)
-    gain = torch.where(inherits, 1 + known.counts[owner] / total[owner], 1.0).to(new.means.dtype)
-    order = torch.arange(len(new), device=owner.device)
-    first = torch.full_like(known.counts, len(new)).scatter_reduce(0, owner, order, "amin")
-    where = (assignment.covered & (first < len(new))).nonzero().squeeze(1)
-    rest = torch.ones_like(inherits).index_fill_(0, first[where], False).nonzero().squeeze(1)
-    order = torch.cat([first[where], rest])
-    scatters = new.scatters * gain[:, None, None]
-    return take_clusters(
-        Clusters((new.counts * gain).round().long(), new.means, scatters), order
-    ), where
+    part = merge_clusters(part, new, is_occupied, task.config.zeta, floor)
+    index = native.build_index(part.centers, task.kernel.num_neighbors)
+    kinds = torch.where(labels == UNKNOWN, 2, (labels < UNKNOWN).long())
+    samples = (points, labels, balanced(kinds, torch.ones_like(labels), task.config.fit))
+    weights, _ = trained(part, index, samples, FitTask(task.kernel, task.config.fit, task.rng))
+    return replace(part, weights=weights)

@@ -249,20 +249,18 @@ def _register() -> None:
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.bool)
 
+    @library.register_fake("lardhm::keep_points")
+    def _(points: Tensor, owners: Tensor, num_clusters: int, size: int) -> Tensor:
+        return points.new_empty(num_clusters, size, points.shape[1])
+
     @library.register_fake("lardhm::descent")
     def _(indices: Tensor, values: Tensor, labels: Tensor, factors: Tensor, weights: Tensor,
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
         return tuple(torch.empty_like(weights) for _ in range(3))
 
-    @library.register_fake("lardhm::explain")
-    def _(points: Tensor, *clusters_and_rule: Any) -> tuple[Tensor, ...]:
-        owners = points.new_empty(points.shape[0], dtype=torch.int32)
-        return owners, *(torch.empty_like(moments) for moments in clusters_and_rule[:3])
-
-    @library.register_fake("lardhm::possibly_inside")
-    @library.register_fake("lardhm::unexplained")
+    @library.register_fake("lardhm::nearest_clusters")
     def _(points: Tensor, *_: Any) -> Tensor:
-        return points.new_empty(library.get_ctx().new_dynamic_size(), points.shape[1])
+        return points.new_empty(points.shape[0], dtype=torch.int32)
 
     @library.register_fake("lardhm::reaching")
     def _(centers: Tensor, *_: Any) -> Tensor:

@@ -1,5 +1,4 @@
-// Updates with scans: assigns points to the clusters that explain them, and finds the clusters that a
-// scan can change.
+// Updates with scans: the cluster that a point belongs to, and the clusters that a scan can change.
 
 #include <algorithm>
 #include <atomic>
@@ -7,59 +6,44 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <tuple>
 #include <vector>
 
 #include "clusters.h"
 #include "kernel.h"
-#include "moments.h"
 #include "sorting.h"
 
 namespace lardhm {
 namespace {
 
-// k = 1: the nearest center of every point, how far it is in standard deviations, and the moments of
-// the points that are near enough.
+// k = 1: the nearest center of every point, if it is near enough in standard deviations.
 template <class T, int D>
-struct ExplainVisitor final : Visitor<T, D> {
+struct OwnerVisitor final : Visitor<T, D> {
   using V = typename Simd<T>::V;
   const int32_t* order;
   const T *positions, *shapes;
-  T joins, explains;  // squared standard deviations
-  int32_t none;
+  T limit;  // squared standard deviations
   int32_t* owners;
-  double* sums;  // (M, kMoments<D>) by rank
 
-  ExplainVisitor(const Parameters<T, D>& parameters, double radius, double reach, int32_t* owners_,
-                 double* sums_)
+  OwnerVisitor(const Parameters<T, D>& parameters, double radius, int32_t* owners_)
       : order(parameters.index.order), positions(parameters.positions.data),
-        shapes(parameters.shapes.data), joins(T(radius * radius)), explains(T(reach * reach)),
-        none(int32_t(parameters.index.header.count)), owners(owners_), sums(sums_) {}
+        shapes(parameters.shapes.data), limit(T(radius * radius)), owners(owners_) {}
 
-  void invalid(int64_t row) override { owners[row] = none; }
+  void invalid(int64_t row) override { owners[row] = -1; }
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
-    T at[D][Simd<T>::W];
-    std::memcpy(at, packet.x, sizeof(at));
     for (int64_t j = 0; j < selected.size; ++j) {
       const int64_t rank = selected.rank[j];
-      const T* center = positions + rank * Layout<D>::position;
       V z[D];
-      whiten<T, D>(packet, center, shapes + rank * Layout<D>::shape, z);
+      whiten<T, D>(packet, positions + rank * Layout<D>::position,
+                   shapes + rank * Layout<D>::shape, z);
       V squared = z[0] * z[0];
       for (int d = 1; d < D; ++d) squared += z[d] * z[d];
       T distance[Simd<T>::W];
       std::memcpy(distance, &squared, sizeof(squared));
-      double own[kMoments<D>] = {};
       for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
-        owners[packet.row(lane)] = distance[lane] <= explains ? order[rank] : none;
-        if (!(distance[lane] <= joins)) continue;
-        T offset[D];
-        for (int d = 0; d < D; ++d) offset[d] = at[d][lane] - center[d];
-        add_moments<T, D>(offset, true, own);
+        owners[packet.row(lane)] = distance[lane] <= limit ? order[rank] : -1;
       }
-      for (int i = 0; i < kMoments<D>; ++i) sums[rank * kMoments<D> + i] += own[i];
     }
   }
 };
@@ -83,31 +67,9 @@ void write_raw_factors(const Tensor& counts, const Tensor& scatters, double floo
   check(definite, "a covariance is not positive definite");
 }
 
-// Number, mean and scatter of the points of each center.
-template <class T, int D>
-void write_found(const MomentParts<D>& moments, const int32_t* order, const T* centers,
-                 int64_t* counts, T* means, T* scatters) {
-  for (int64_t rank = 0; rank < moments.count; ++rank) {
-    double sum[kMoments<D>], shift[D];
-    moments.total(rank, kMoments<D>, sum);
-    const int64_t row = order[rank];
-    counts[row] = int64_t(sum[0]);
-    for (int d = 0; d < D; ++d) {
-      shift[d] = sum[1 + d] / std::max(sum[0], 1.0);
-      means[row * D + d] = T(double(centers[row * D + d]) + shift[d]);
-    }
-    const double* product = sum + 1 + D;
-    for (int i = 0; i < D; ++i)
-      for (int j = 0; j <= i; ++j, ++product)
-        scatters[(row * D + i) * D + j] = scatters[(row * D + j) * D + i] =
-            T(*product - sum[1 + i] * shift[j]);
-  }
-}
-
-using Explained = std::tuple<Tensor, Tensor, Tensor, Tensor>;
-
-Explained explain(const Tensor& given_points, const Tensor& given_counts, const Tensor& given_means,
-                  const Tensor& given_scatters, double floor, double radius, double reach) {
+Tensor nearest_clusters(const Tensor& given_points, const Tensor& given_counts,
+                        const Tensor& given_means, const Tensor& given_scatters, double floor,
+                        double radius) {
   const Tensor points = tidy(given_points), counts = tidy(given_counts);
   const Tensor means = tidy(given_means), scatters = tidy(given_scatters);
   check_rows("points", points, means);
@@ -117,30 +79,21 @@ Explained explain(const Tensor& given_points, const Tensor& given_counts, const 
   const Tensor weights = torch::stable::new_zeros(means, {count});
   const Tensor no_index = torch::stable::new_empty(means, {0}, ScalarType::Byte);
   const Tensor raw = torch::stable::new_empty(scatters, scatters.sizes());
-  const Explained result{torch::stable::new_empty(points, {n}, ScalarType::Int),
-                         torch::stable::new_empty(counts, counts.sizes()),
-                         torch::stable::new_empty(means, means.sizes()),
-                         torch::stable::new_empty(scatters, scatters.sizes())};
+  const Tensor owners = torch::stable::new_empty(points, {n}, ScalarType::Int);
   dispatch(means, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
     write_raw_factors<T, D>(counts, scatters, floor, out<T>(raw));
     const MapTensors map(means, raw, weights, no_index, 1.0, 0.0);
     with_parameters<T, D>(map, n, [&](Parameters<T, D>& parameters) {
-      const int64_t bytes = count * kMoments<D> * sizeof(double);
-      MomentParts<D> moments(count, parts_of(n, bytes, parameters));
-      std::vector<ExplainVisitor<T, D>> visitors;
-      for (int64_t part = 0; part < moments.parts; ++part)
-        visitors.emplace_back(parameters, radius, reach, out<int32_t>(std::get<0>(result)),
-                              moments.part(part));
+      std::vector<OwnerVisitor<T, D>> visitors;
+      for (int64_t part = 0; part < parts_of(n, 1, parameters); ++part)
+        visitors.emplace_back(parameters, radius, out<int32_t>(owners));
       if (n) visit_parts<T, D>(in<T>(points), n, parameters, 1, each_of<T, D>(visitors));
-      write_found<T, D>(moments, parameters.index.order, in<T>(means),
-                        out<int64_t>(std::get<1>(result)), out<T>(std::get<2>(result)),
-                        out<T>(std::get<3>(result)));
     });
     return 0;
   });
-  return result;
+  return owners;
 }
 
 // Whether a kernel's extent along every axis, `stds` standard deviations, meets the box.
@@ -201,14 +154,14 @@ Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_po
 
 STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
   m.def(
-      "explain(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
-      "float radius, float reach) -> (Tensor, Tensor, Tensor, Tensor)");
+      "nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
+      "float radius) -> Tensor");
   m.def(
       "reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
       "float covariance_scale, float min_lengthscale) -> Tensor");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("explain", TORCH_BOX(&lardhm::explain));
+  m.impl("nearest_clusters", TORCH_BOX(&lardhm::nearest_clusters));
   m.impl("reaching", TORCH_BOX(&lardhm::reaching));
 }

@@ -25,7 +25,7 @@ from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.atomic_files import remove_partials
 from lardhm_torch.io.map_files import SAFETENSORS
 from lardhm_torch.learning.fitting import FitConfig
-from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.learning.parameters import write_state
 from lardhm_torch.tiles.cluster_files import (
     clustered_points,
@@ -188,12 +188,10 @@ class _Job:
         clusters = own.clusters
         model = LardHilbertMap(**self.manifest.settings).to(weights)
         origin = torch.tensor(self._origin(index), device=self.device)
-        moments = (clusters.counts, clusters.means, clusters.scatters)
-        write_state(
-            model, MapState(weights, clusters.means, raw, own.is_occupied, *moments), origin
-        )
+        rows = new_rows(clusters, own.is_occupied, kernel.min_lengthscale)
+        write_state(model, replace(rows, weights=weights, raw_scale_tril=raw), origin)
         path = self._fitted_path(index, SAFETENSORS)
-        model.cpu().save(path)
+        model.cpu().save(path, evidence=False)
         record = tile_record(model, path, self.ledger.tiles[index].core)
         body = {"chunks": self.ledger.chunks, "tile": tile_to_json(record)}
         write_page(self._fitted_path(index, ".json"), body, durable=False)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.learning.parameters import PER_MAP
+from lardhm_torch.learning.parameters import HISTORY, PER_MAP
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.indexing import Folder, tile_indices, tile_path
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest
@@ -40,7 +40,7 @@ def split_map(model: LardHilbertMap, folder: Folder, edge: float) -> None:
         indices.tolist(), owner.argsort(stable=True).split(counts.tolist()), strict=True
     ):
         tile, path = _select_clusters(model, rows), tile_path(folder, tuple(index))
-        tile.save(path)
+        tile.save(path, evidence=False)
         tiles[tuple(index)] = tile_record(tile, path, int(tile.counts.sum()))
     write_manifest(folder, replace(manifest, tiles=tiles))
 
@@ -57,9 +57,9 @@ def _select_clusters(model: LardHilbertMap, rows: Tensor) -> LardHilbertMap:
 
 
 def state_of(model: LardHilbertMap) -> TileState:
-    """The tensors of a map by name, not copied."""
+    """The tensors of a map that answer queries, by name, not copied."""
     tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-    return {name: tensor.detach() for name, tensor in tensors.items()}
+    return {name: tensor.detach() for name, tensor in tensors.items() if name not in HISTORY}
 
 
 @torch.no_grad()

@@ -1,0 +1,154 @@
+"""Evidence: a bounded random sample of the points of each cluster.
+
+Every point has a priority, a hash of its coordinates, and a cluster keeps the `EVIDENCE` points of
+smallest priority. The kept points are a uniform random sample of all points that the cluster
+received. They do not depend on the order of the scans or on how scans are divided into updates, and
+repeated points change nothing.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.learning.clustering import (
+    Clusters,
+    clusters_from_moments,
+    split_labels,
+    spread_rows,
+)
+from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
+
+SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
+MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
+BITS = 31  # of a priority
+
+
+def priorities(points: Tensor) -> Tensor:
+    """(N, D) positions -> (N,) int64 hashes of the coordinates in float32, below 2^31."""
+    words = points.float().view(torch.int32).long() & 0xFFFFFFFF
+    mixed = torch.zeros_like(words[:, 0])
+    for axis in range(points.shape[1]):
+        mixed = (mixed ^ words[:, axis]) * MULTIPLIERS[axis % 3] & 0xFFFFFFFF
+        mixed = mixed ^ (mixed >> 15)
+    mixed = mixed * MULTIPLIERS[1] & 0xFFFFFFFF
+    return mixed >> (32 - BITS)
+
+
+def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
+    """The points of smallest priority of each cluster. Equal points are kept once.
+
+    Args:
+        points: (N, D) positions [m].
+        owners: (N,) cluster of each point; points with any other number are left out.
+        num_clusters: M.
+
+    Returns:
+        (M, E, D) positions, ascending by priority; infinity where a cluster has fewer points.
+    """
+    if native.supports(points):
+        return torch.ops.lardhm.keep_points(points, owners.int(), num_clusters, EVIDENCE)
+    rows = ((owners >= 0) & (owners < num_clusters)).nonzero().squeeze(1)
+    points, owners = points[rows], owners[rows].long()
+    for axis in range(points.shape[1]):  # equal priorities: in the order of the coordinates
+        order = points[:, -1 - axis].argsort(stable=True)
+        points, owners = points[order], owners[order]
+    keys, order = (owners << BITS | priorities(points)).sort(stable=True)
+    points, owners = points[order], owners[order]
+    repeated = torch.zeros_like(keys, dtype=torch.bool)
+    repeated[1:] = (keys[1:] == keys[:-1]) & (points[1:] == points[:-1]).all(dim=1)
+    points, owners = points[~repeated], owners[~repeated]
+    first = torch.searchsorted(owners, torch.arange(num_clusters, device=owners.device))
+    place = torch.arange(len(owners), device=owners.device) - first[owners]
+    kept = place < EVIDENCE
+    evidence = points.new_full((num_clusters, EVIDENCE, points.shape[1]), torch.inf)
+    evidence[owners[kept], place[kept]] = points[kept]
+    return evidence
+
+
+def kept_counts(evidence: Tensor) -> Tensor:
+    """(M, E, D) evidence -> (M,) number of kept points."""
+    return (~evidence[:, :, 0].isinf()).sum(dim=1)
+
+
+def kept_points(evidence: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, E, D) evidence -> (L, D) kept points and (L,) their clusters, ascending."""
+    mask = ~evidence[:, :, 0].isinf()
+    return evidence[mask], mask.nonzero()[:, 0]
+
+
+def first_points(evidence: Tensor, counts: Tensor) -> Tensor:
+    """Evidence reduced to the first ``counts`` (M,) points of each cluster."""
+    place = torch.arange(evidence.shape[1], device=evidence.device)
+    return evidence.where((place < counts[:, None])[:, :, None], torch.inf)
+
+
+def evidence_moments(evidence: Tensor) -> Clusters:
+    """Moments of the kept points of M clusters; the mean is not finite if a cluster has none."""
+    mask = ~evidence[:, :, :1].isinf()
+    offsets = torch.where(mask, evidence - evidence[:, :1], 0)
+    counts = mask.sum(dim=(1, 2))
+    sums, scatters = offsets.sum(dim=1), offsets.mT @ offsets
+    return clusters_from_moments(evidence[:, 0], counts, sums, scatters)
+
+
+def halves(evidence: Tensor) -> tuple[Tensor, Tensor]:
+    """Evidence of the two halves of each cluster, divided at the mean along its longest axis."""
+    clusters = evidence_moments(evidence)
+    axes = torch.linalg.eigh(clusters.covariances).eigenvectors[:, :, -1]
+    along = ((evidence - clusters.means[:, None]) * axes[:, None]).sum(dim=2)
+    parts = []
+    for inside in (along > 0, along <= 0):  # padding is in neither
+        order = inside.int().argsort(dim=1, descending=True, stable=True)
+        part = evidence.gather(1, order[:, :, None].expand_as(evidence))
+        parts.append(first_points(part, inside.sum(dim=1)))
+    return parts[0], parts[1]
+
+
+def fitted_evidence(
+    points: Tensor, labels: Tensor, state: MapState, rng: torch.Generator
+) -> Tensor:
+    """(M, E, D) evidence of clusters that were fitted to points of their classes.
+
+    It is chosen from a random subset of the points if there are many.
+
+    Args:
+        points: (N, D) positions [m], in the order of `morton_order`.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
+        state: M clusters, at least one of every class of the points.
+        rng: random generator of the subset.
+    """
+    evidence = torch.empty_like(state.evidence)
+    for kind, members in enumerate(split_labels(points, labels)):
+        rows = (state.kinds == kind).nonzero().squeeze(1)
+        if len(rows) == 0:
+            continue
+        count = SAMPLE_FACTOR * EVIDENCE * len(rows)
+        if len(members) > count:
+            members = members[spread_rows(len(members), count, rng)]
+        owners = native.nearest_centers(members, state.means[rows], 1).squeeze(1)
+        evidence[rows] = keep_points(members, owners, len(rows))
+    return evidence
+
+
+def with_evidence(state: MapState, floor: float, rng: torch.Generator) -> Tensor:
+    """(M, E, D) evidence of a map; drawn from the moments of clusters that keep no points.
+
+    Clusters have no evidence if the map was saved without it. Points are then drawn uniformly from
+    ellipsoids with the means and covariances of the clusters.
+    """
+    empty = (kept_counts(state.evidence) == 0).nonzero().squeeze(1)
+    if len(empty) == 0:
+        return state.evidence
+    lost = state.rows(empty)
+    factors = factor_covariances(lost.clusters.covariances, floor)
+    dim = factors.shape[1]
+    shape = (len(empty), EVIDENCE, dim)
+    direction = torch.randn(shape, generator=rng, device=rng.device).to(factors)
+    direction /= torch.linalg.vector_norm(direction, dim=2, keepdim=True)
+    volume = torch.rand(len(empty), EVIDENCE, 1, generator=rng, device=rng.device).to(factors)
+    ball = (dim + 2) ** 0.5 * volume ** (1 / dim) * direction
+    points = (lost.means[:, None] + ball @ factors.mT).reshape(-1, dim)
+    owners = torch.arange(len(empty), device=points.device).repeat_interleave(EVIDENCE)
+    return state.evidence.index_copy(0, empty, keep_points(points, owners, len(empty)))

@@ -1,0 +1,159 @@
+"""Training of the weights of changed clusters on the evidence around them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.features import Kernel
+from lardhm_torch.learning.assignment import ordered_features
+from lardhm_torch.learning.evidence import kept_counts, kept_points
+from lardhm_torch.learning.fitting import (
+    FitConfig,
+    FitTask,
+    fit_weights,
+    label_factors,
+    stratified_batches,
+)
+from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.points import UNKNOWN, morton_order
+
+FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
+BLOCK = 128  # clusters that are chosen for training together
+MIN_BATCHES = 8  # per pass, so that few points give enough steps, too
+LOSS_STRIDE = 4  # losses are estimated from one of so many samples
+KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
+
+
+def retrained(
+    state: MapState, limit: int, kernel: Kernel, config: FitConfig, rng: torch.Generator
+) -> MapState:
+    """Train the weights of changed clusters and their neighbors on evidence; other weights are fixed.
+
+    A cluster has changed if more than `FRESH` of its kept points are new.
+
+    The evidence of the neighbors of those constrains them, too. ``losses`` of all clusters whose
+    evidence was used are updated.
+
+    Args:
+        state: M clusters.
+        limit: maximum number of changed clusters to train; the others are trained later.
+        kernel: kernel settings of the map.
+        config: passes, rates and regularizer.
+        rng: random generator.
+    """
+    index = native.build_index(state.centers, kernel.num_neighbors)
+    changed = _stalest(state, limit)
+    if not bool(changed.any()):
+        return state
+    moving = changed | _neighbors(changed, state.centers, kernel.num_neighbors, index)
+    beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
+    rows = (moving | beside).nonzero().squeeze(1)
+    points, owners = kept_points(state.evidence[rows])
+    owners = rows[owners]
+    kinds, strength = state.kinds[owners], evidence_weights(state)[owners]
+    factors = balanced(kinds, strength, config)
+    labels = KIND_LABELS.to(points)[kinds]
+    fewest = max(1, len(points) // MIN_BATCHES)
+    config = replace(config, batch_size=min(config.rows_per_batch(len(points)), fewest))
+    task = FitTask(kernel, config, rng)
+    weights, (rows, losses) = trained(state, index, (points, labels, factors), task)
+    owners = owners[rows]
+    found = torch.bincount(owners, minlength=len(state))
+    losses = torch.zeros_like(weights).index_add_(0, owners, losses) / found
+    return replace(
+        state,
+        weights=torch.where(moving, weights, state.weights),
+        losses=torch.where(found > 0, losses, state.losses),
+        fresh=state.fresh.masked_fill(moving, 0),
+    )
+
+
+def trained(
+    state: MapState, index: Tensor, samples: tuple[Tensor, Tensor, Tensor], task: FitTask
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Train all weights on weighted samples, starting from the weights of the state.
+
+    Args:
+        state: M clusters.
+        index: search index of the centers, see `native.build_index`.
+        samples: (N, D) positions [m]; (N,) labels in [0, 1]; (N,) loss factors, mean 1.
+        task: kernel, training settings and random generator.
+
+    Returns:
+        (M,) weights; and a subset of the samples with the loss of each, in excess of that of a perfect
+        prediction.
+    """
+    points, labels, factors = samples
+    config = task.config
+    batch_size = config.rows_per_batch(len(points))
+    along = morton_order(points)
+    (batched,) = stratified_batches((along,), batch_size, task.rng)
+    points = points.index_select(0, along)
+    place = torch.empty_like(along)
+    place[along] = torch.arange(len(along), device=along.device)
+    features = ordered_features(
+        points, place[batched], state.centers, state.raw_scale_tril, task.kernel, index
+    )
+    targets = labels[batched]
+    weights = fit_weights(
+        lambda rows: (features[0][rows], features[1][rows]),
+        targets, state.weights, config, factors=factors[batched],
+    )  # fmt: skip
+    rows = slice(None, None, LOSS_STRIDE)
+    log_odds = (features[1][rows] * weights[features[0][rows]]).sum(dim=1)
+    targets, batched = targets[rows], batched[rows]
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, targets, reduction="none")
+    return weights, (
+        batched,
+        loss + torch.xlogy(targets, targets) + torch.xlogy(1 - targets, 1 - targets),
+    )
+
+
+def _stalest(state: MapState, limit: int) -> Tensor:
+    """(M,) mask of the clusters with the largest fractions of new points, at most ``limit``.
+
+    They are chosen in blocks of clusters that are close to each other, because the neighbors of the
+    chosen ones are needed, too.
+    """
+    share = state.fresh / kept_counts(state.evidence)
+    changed = share > FRESH
+    if int(changed.sum()) <= limit:
+        return changed
+    order = morton_order(state.centers)
+    block = torch.empty_like(order)
+    block[order] = torch.arange(len(order), device=order.device) // BLOCK
+    count = int(block.max()) + 1
+    total = torch.zeros(count, device=order.device).index_add_(0, block, (share * changed).float())
+    chosen = torch.zeros(count, dtype=torch.bool, device=order.device)
+    chosen[total.topk(max(1, limit // BLOCK)).indices] = True
+    return changed & chosen[block]
+
+
+def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
+    """(M,) mask of clusters -> (M,) mask of the neighbors of their centers."""
+    near = native.nearest_centers(centers[mask], centers, num_neighbors, index)
+    return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
+
+
+def evidence_weights(state: MapState) -> Tensor:
+    """(M,) weight of each kept point of a cluster.
+
+    A kept point represents count / kept points. Its weight is the square root of that, between one
+    weight for each point that was seen and one for each point that is kept.
+    """
+    represented = state.counts / kept_counts(state.evidence).clamp(min=1)
+    return represented.clamp(min=1).sqrt().to(state.weights)
+
+
+def balanced(kinds: Tensor, strength: Tensor, config: FitConfig) -> Tensor:
+    """(N,) loss factors, mean 1: sample weights within a class, and classes balanced as in `fit`."""
+    labels = KIND_LABELS.to(strength)[kinds]
+    shares = label_factors(labels, config.occupied_share, config.unknown_share).to(strength)
+    means = torch.zeros_like(shares).index_add_(0, kinds, strength)
+    means /= torch.bincount(kinds, minlength=3).clamp(min=1)
+    factors = strength * (shares.flip(0)[[0, 2, 1]] / means)[kinds]
+    return factors / factors.mean()

@@ -1,0 +1,123 @@
+// Evidence of clusters: the points of smallest priority of each, see `learning/evidence.py`.
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "clusters.h"
+
+namespace lardhm {
+namespace {
+
+constexpr uint32_t kMultipliers[3] = {0x9E3779B1u, 0x85EBCA77u, 0xC2B2AE3Du};
+
+// Hash of the coordinates in float32, below 2^31.
+template <class T, int D>
+uint32_t priority(const T* point) {
+  uint32_t mixed = 0;
+  for (int d = 0; d < D; ++d) {
+    const float value = float(point[d]);
+    uint32_t word;
+    std::memcpy(&word, &value, sizeof(word));
+    mixed = (mixed ^ word) * kMultipliers[d % 3];
+    mixed ^= mixed >> 15;
+  }
+  return (mixed * kMultipliers[1]) >> 1;
+}
+
+// Rows of the points of each cluster: those of cluster m are rows[first[m]] to rows[first[m + 1]].
+struct Groups {
+  std::vector<int64_t> first;
+  std::vector<int32_t> rows;
+
+  Groups(const int32_t* owners, int64_t n, int64_t count) : first(count + 1, 0) {
+    for (int64_t i = 0; i < n; ++i)
+      if (owners[i] >= 0 && owners[i] < count) ++first[owners[i] + 1];
+    for (int64_t m = 0; m < count; ++m) first[m + 1] += first[m];
+    rows.resize(first[count]);
+    std::vector<int64_t> next(first.begin(), first.end() - 1);
+    for (int64_t i = 0; i < n; ++i)
+      if (owners[i] >= 0 && owners[i] < count) rows[next[owners[i]]++] = int32_t(i);
+  }
+};
+
+template <class T, int D>
+struct Candidate {
+  uint32_t priority;
+  T point[D];
+
+  bool operator<(const Candidate& other) const {
+    if (priority != other.priority) return priority < other.priority;
+    return std::lexicographical_compare(point, point + D, other.point, other.point + D);
+  }
+  bool operator==(const Candidate& other) const {
+    return priority == other.priority && std::equal(point, point + D, other.point);
+  }
+};
+
+// The first candidates as a cluster's evidence; infinity where there are fewer than `size`.
+template <class T, int D>
+void write(const std::vector<Candidate<T, D>>& found, int64_t size, T* to) {
+  const int64_t kept = std::min<int64_t>(size, found.size());
+  for (int64_t i = 0; i < kept; ++i) std::copy_n(found[i].point, D, to + i * D);
+  std::fill_n(to + kept * D, (size - kept) * D, std::numeric_limits<T>::infinity());
+}
+
+// The `size` smallest distinct candidates of a cluster, ascending.
+template <class T, int D>
+void keep(const T* points, const int32_t* rows, int64_t n, int64_t size,
+          std::vector<Candidate<T, D>>& found, T* to) {
+  found.resize(n);
+  for (int64_t i = 0; i < n; ++i) {
+    const T* point = points + int64_t(rows[i]) * D;
+    found[i].priority = priority<T, D>(point);
+    std::copy_n(point, D, found[i].point);
+  }
+  if (n > 4 * size) {  // repeated points are rare: the smallest 2 size hold enough distinct ones
+    std::nth_element(found.begin(), found.begin() + 2 * size, found.end());
+    std::sort(found.begin(), found.begin() + 2 * size);
+    const auto end = std::unique(found.begin(), found.begin() + 2 * size);
+    if (end - found.begin() >= size) return write(found, size, to);
+    found.erase(end, found.begin() + 2 * size);
+  }
+  std::sort(found.begin(), found.end());
+  found.erase(std::unique(found.begin(), found.end()), found.end());
+  write(found, size, to);
+}
+
+Tensor keep_points(const Tensor& given_points, const Tensor& given_owners, int64_t num_clusters,
+                   int64_t size) {
+  const Tensor points = tidy(given_points), owners = tidy(given_owners);
+  check(points.dim() == 2 && owners.numel() == points.size(0) &&
+            owners.scalar_type() == ScalarType::Int && num_clusters >= 0 && size > 0,
+        "owners must be (N,) int32, one per point, and size > 0");
+  const Tensor kept = torch::stable::new_empty(points, {num_clusters, size, points.size(1)});
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const Groups groups(in<int32_t>(owners), points.size(0), num_clusters);
+    constexpr int64_t kGrain = 64;
+    run_tasks((num_clusters + kGrain - 1) / kGrain, [&](int64_t task) {
+      std::vector<Candidate<T, D>> found;
+      for (int64_t m = task * kGrain; m < std::min(num_clusters, (task + 1) * kGrain); ++m)
+        keep<T, D>(in<T>(points), groups.rows.data() + groups.first[m],
+                   groups.first[m + 1] - groups.first[m], size, found,
+                   out<T>(kept) + m * size * D);
+    });
+    return 0;
+  });
+  return kept;
+}
+
+}  // namespace
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def("keep_points(Tensor points, Tensor owners, int num_clusters, int size) -> Tensor");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
+  m.impl("keep_points", TORCH_BOX(&lardhm::keep_points));
+}
