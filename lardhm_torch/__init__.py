@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.queries.collision import expected_range as expected_range
     from lardhm_torch.queries.collision import free_probability as free_probability
     from lardhm_torch.queries.collision import segment_hazard as segment_hazard
+    from lardhm_torch.queries.distance import signed_distance as signed_distance
+    from lardhm_torch.queries.distance import surface_distance as surface_distance
     from lardhm_torch.queries.exploration import frontiers as frontiers
     from lardhm_torch.queries.exploration import information_gain as information_gain
     from lardhm_torch.queries.grids import grid as grid
@@ -65,6 +67,7 @@ _NAMES = {
         "free_probability",
         "segment_hazard",
     ],
+    "queries.distance": ["signed_distance", "surface_distance"],
     "queries.exploration": ["frontiers", "information_gain"],
     "queries.grids": ["grid", "query_grid", "query_slice"],
     "queries.raycasting": ["raycast"],

@@ -137,6 +137,11 @@ def _file_verbs(verb: Any) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
     _output(sub, "grid to write: .npz, or .bt or .ot for OctoMap")
     _resolution(sub, 0.1)
+    sub.add_argument(
+        "--distance",
+        action="store_true",
+        help="write signed distances to the nearest surface [m]; only .npz",
+    )
 
 
 def _picture_verbs(verb: Any) -> None:

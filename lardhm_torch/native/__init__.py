@@ -185,6 +185,30 @@ def assign(
     return labels, counts.to(dtype), sums.to(dtype), scatters.to(dtype)
 
 
+def face_tree(centers: Tensor, axes: Tensor, half: Tensor) -> Tensor:
+    """What the search knows of F faces (see `faces.Faces`); empty where it is not available."""
+    if not supports(centers) or centers.dtype != torch.float64:
+        return torch.empty(0, dtype=torch.uint8, device=centers.device)
+    return torch.ops.lardhm.face_tree(centers, axes, half)
+
+
+def has_tree(tree: Tensor) -> bool:
+    """Whether `nearest_face` can search with this tree."""
+    return len(tree) > 0
+
+
+def nearest_face(
+    points: Tensor, faces: Any, max_distance: float, gradient: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `distance.nearest_faces` and `distance.face_distances`, for (N, D) float64 points.
+
+    Returns:
+        (N,) signed distances [m], (N, D) gradients (or none at all), (N,) faces.
+    """
+    given = (points.detach(), faces.tree, faces.centers, faces.axes, faces.half)
+    return torch.ops.lardhm.nearest_face(*given, max_distance, gradient)
+
+
 def descends(indices: Tensor, values: Tensor) -> bool:
     """Whether `torch.ops.lardhm.descent` can train on these features."""
     fits = values.device.type == "cpu" and values.dtype in DTYPES

@@ -1,0 +1,204 @@
+"""Signed distance to the nearest surface of a map, with gradient."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, to_tensor
+from lardhm_torch.queries.faces import Faces, surface_faces
+from lardhm_torch.queries.grids import EVIDENCE, cluster_boxes
+
+CHUNK_PAIRS = 1 << 20  # pairs of a point and a face at a time
+MARGIN = 1.0  # [m] around a box: clusters of the faces in it
+FIRST_REACH = 4.0  # [m] how far a tiled map looks first
+
+
+def signed_distance(
+    model: OccupancyMap, points: TensorLike, max_distance: float = math.inf
+) -> Tensor:
+    """Distance to the nearest surface, negative behind it; differentiable in the points.
+
+    The surface consists of flat `faces` where the hits lie. The distance is negative where the
+    nearest face is seen from behind and the map does not hold the point to be free (log-odds below
+    -1): inside of obstacles, and in the unknown space behind a wall that was seen from one side
+    only. A face seen obliquely from behind, from farther beside than below it, counts as seen from
+    its front.
+
+    Unlike `clearance`, this is an estimate, not a bound. The gradient has length 1, and is 0 where
+    nothing is nearer than ``max_distance``.
+
+    Args:
+        model: the map.
+        points: (..., D) world positions [m].
+        max_distance: result where no surface is nearer [m]; a finite one saves time.
+
+    Returns:
+        (...) distances in the dtype of the points, float64 for arrays and lists [m]; NaN for a
+        point that is not finite.
+
+    Raises:
+        ValueError: points are not (..., D), or max_distance is not > 0.
+    """
+    if not max_distance > 0:
+        raise ValueError(f"max_distance must be > 0 m; got {max_distance}")
+    dtype = torch.float64
+    if isinstance(points, Tensor) and points.is_floating_point():
+        dtype = points.dtype
+    points = to_tensor(points, "points", model.origin.device)
+    if points.ndim == 0 or points.shape[-1] != model.dim:
+        raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
+    flat = points.reshape(-1, model.dim)
+    if not hasattr(model, "local_parts"):
+        result = _distances(model, flat, max_distance)
+    else:
+        result = _in_parts(model, flat, max_distance)
+    return result.reshape(points.shape[:-1]).to(dtype)
+
+
+def surface_distance(
+    model: OccupancyMap, points: TensorLike, max_distance: float = math.inf
+) -> Tensor:
+    """Distance to the nearest surface, on either side of it: the size of `signed_distance`.
+
+    Args:
+        model: the map.
+        points: (..., D) world positions [m].
+        max_distance: result where no surface is nearer [m].
+
+    Returns:
+        (...) distances, 0 or more [m].
+    """
+    return signed_distance(model, points, max_distance).abs()
+
+
+def _distances(model: OccupancyMap, points: Tensor, max_distance: float) -> Tensor:
+    """(N,) signed distances of (N, D) float64 world positions."""
+    result = _Distance.apply(points - model.origin, surface_faces(model), max_distance)
+    behind = (result.detach() < 0).nonzero().squeeze(1)
+    if len(behind) == 0:
+        return result
+    with torch.no_grad():
+        is_free = model.log_odds(points.detach()[behind]) < -EVIDENCE
+    return result * torch.ones_like(result).index_fill_(0, behind[is_free], -1.0)
+
+
+def _in_parts(model: OccupancyMap, points: Tensor, max_distance: float) -> Tensor:
+    """The same for a tiled map, which looks farther and farther for what is not near."""
+    result = points.new_full((len(points),), max_distance)
+    result = result + 0 * points.detach().sum(dim=1)  # NaN where a point is not finite
+    left = points.detach().isfinite().all(dim=1).nonzero().squeeze(1)
+    ends = _far_ends(model)
+    if ends is None:
+        return result
+    reach = FIRST_REACH
+    while len(left):
+        most = min(reach, max_distance)
+        some = points[left]
+        lower, upper = (some.detach() + side * (most + MARGIN) for side in (-1, 1))
+        lower, upper = (
+            lower.maximum(ends[0]).minimum(ends[1]),
+            upper.minimum(ends[1]).maximum(ends[0]),
+        )
+        found = some.new_full((len(left),), torch.inf)
+        for rows, part in local_parts(model, lower, upper):
+            found = found.index_copy(0, rows, _distances(part, some[rows], most))
+        near = found.detach().abs() < most
+        result = result.index_copy(0, left[near], found[near])
+        covered = ((lower <= ends[0]) & (upper >= ends[1])).all(dim=1)
+        left = left[~near & ~covered & (most < max_distance)]
+        reach *= 2
+    return result
+
+
+def _far_ends(model: OccupancyMap) -> tuple[Tensor, Tensor] | None:
+    """Corners of a box around all surfaces of a map; None if it has none."""
+    lower, upper = cluster_boxes(model, sign=1)
+    return (lower.amin(dim=0), upper.amax(dim=0)) if len(lower) else None
+
+
+class _Distance(torch.autograd.Function):
+    """Signed distances of (N, D) float64 points in the map's frame to the nearest faces."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, faces: Faces, max_distance: float) -> Tensor:
+        wanted = ctx.needs_input_grad[0]
+        if native.has_tree(faces.tree):
+            values, gradients, nearest = native.nearest_face(points, faces, max_distance, wanted)
+            ctx.save_for_backward(points, gradients, nearest)
+        else:
+            nearest = nearest_faces(points, faces, max_distance)
+            values = face_distances(points, faces, nearest, max_distance)
+            ctx.save_for_backward(points, None, nearest)
+        ctx.faces, ctx.max_distance = faces, max_distance
+        return values
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:
+        points, gradients, nearest = ctx.saved_tensors
+        if gradients is not None and not torch.is_grad_enabled():
+            return grad[:, None] * gradients, None, None
+        with torch.enable_grad():
+            inputs = points if points.requires_grad else points.detach().requires_grad_()
+            values = face_distances(inputs, ctx.faces, nearest, ctx.max_distance)
+            (slope,) = torch.autograd.grad(values, inputs, grad, create_graph=grad.requires_grad)
+        return slope, None, None
+
+
+@torch.no_grad()
+def nearest_faces(points: Tensor, faces: Faces, max_distance: float) -> Tensor:
+    """(N,) nearest face of each (N, D) point, -1 where none is nearer than ``max_distance``."""
+    count = len(faces.centers)
+    result = torch.full((len(points),), -1, dtype=torch.long, device=points.device)
+    for rows in _chunks(points, count):
+        some = points[rows]
+        every = torch.arange(count, device=points.device).expand(len(some), -1)
+        values = _to_faces(some[:, None], faces, every).abs()
+        least = values.nan_to_num(torch.inf).min(dim=1)
+        result[rows] = torch.where(least.values < max_distance, least.indices, -1)
+    return result
+
+
+def _chunks(points: Tensor, count: int) -> Iterator[Tensor]:
+    if count:
+        yield from torch.arange(len(points), device=points.device).split(
+            max(1, CHUNK_PAIRS // count)
+        )
+
+
+def face_distances(points: Tensor, faces: Faces, nearest: Tensor, max_distance: float) -> Tensor:
+    """(N,) signed distances of (N, D) points to one face each; ``max_distance`` for face -1."""
+    nothing = (points * 0).sum(dim=1)  # NaN where a point is not finite
+    found = (nearest >= 0).nonzero().squeeze(1)
+    result = nothing + max_distance if math.isfinite(max_distance) else nothing + torch.inf
+    if len(found) == 0:
+        return result
+    return result.index_copy(0, found, _to_faces(points[found], faces, nearest[found]))
+
+
+def _to_faces(points: Tensor, faces: Faces, which: Tensor) -> Tensor:
+    """(...) signed distances of (..., D) points, broadcast, to (...) faces [m].
+
+    With the height z over a face and the distance rho beside its rounded rectangle, the distance is
+    sqrt(z^2 + rho^2). It is negative where the point lies below the face by more than rho.
+    """
+    u = torch.einsum("...d,...de->...e", points - faces.centers[which], faces.axes[which])
+    height = u[..., 0]
+    if u.shape[-1] == 1:
+        return height
+    half = faces.half[which]
+    radius = half.amin(dim=-1)
+    beyond = (u[..., 1:].abs() - (half - radius[..., None])).clamp(min=0)
+    squares = beyond.square().sum(dim=-1)
+    is_off = squares > radius.square()
+    length = torch.where(is_off, squares, 1.0).sqrt()
+    beside = torch.where(is_off, length - radius, 0.0)
+    away = torch.where(is_off, height.square() + beside.square(), 1.0).sqrt()
+    away = torch.where(is_off, away, height.abs())
+    value = torch.where(is_off, away, height)
+    return torch.where(is_off & (-height > beside), -away, value)
