@@ -21,8 +21,8 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.learning.map_merging import merge_maps as merge_maps
     from lardhm_torch.learning.parameters import resize_optimizer as resize_optimizer
     from lardhm_torch.learning.update import UpdateConfig as UpdateConfig
+    from lardhm_torch.queries.clearance import clearance as clearance
     from lardhm_torch.queries.collision import Mover as Mover
-    from lardhm_torch.queries.collision import clearance as clearance
     from lardhm_torch.queries.collision import expected_range as expected_range
     from lardhm_torch.queries.collision import free_probability as free_probability
     from lardhm_torch.queries.collision import segment_hazard as segment_hazard
@@ -60,13 +60,8 @@ _NAMES = {
     "learning.map_merging": ["merge_maps"],
     "learning.parameters": ["resize_optimizer"],
     "learning.update": ["UpdateConfig"],
-    "queries.collision": [
-        "Mover",
-        "clearance",
-        "expected_range",
-        "free_probability",
-        "segment_hazard",
-    ],
+    "queries.clearance": ["clearance"],
+    "queries.collision": ["Mover", "expected_range", "free_probability", "segment_hazard"],
     "queries.distance": ["signed_distance", "surface_distance"],
     "queries.exploration": ["frontiers", "information_gain"],
     "queries.grids": ["grid", "query_grid", "query_slice"],

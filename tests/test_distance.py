@@ -118,7 +118,7 @@ def test_the_native_search_finds_what_the_definition_finds(dim):
     points[:3] *= 1e3
     for most in (math.inf, 0.3):
         values, gradients, nearest = native.nearest_face(points, faces, most, True)
-        plain = module.nearest_faces(points, faces, most)
+        plain = module.plain_nearest(points, faces, most)
         inputs = points.clone().requires_grad_()
         expected = module.face_distances(inputs, faces, plain, most)
         tolerance = 1e-6 * (1 + expected.detach().nan_to_num(0, 0, 0).abs())  # search: float32

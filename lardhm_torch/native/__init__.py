@@ -185,11 +185,11 @@ def assign(
     return labels, counts.to(dtype), sums.to(dtype), scatters.to(dtype)
 
 
-def face_tree(centers: Tensor, axes: Tensor, half: Tensor) -> Tensor:
+def face_tree(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Tensor:
     """What the search knows of F faces (see `faces.Faces`); empty where it is not available."""
-    if not supports(centers) or centers.dtype != torch.float64:
+    if not supports(centers):
         return torch.empty(0, dtype=torch.uint8, device=centers.device)
-    return torch.ops.lardhm.face_tree(centers, axes, half)
+    return torch.ops.lardhm.face_tree(centers, axes, half, thickness)
 
 
 def has_tree(tree: Tensor) -> bool:
@@ -205,8 +205,8 @@ def nearest_face(
     Returns:
         (N,) signed distances [m], (N, D) gradients (or none at all), (N,) faces.
     """
-    given = (points.detach(), faces.tree, faces.centers, faces.axes, faces.half)
-    return torch.ops.lardhm.nearest_face(*given, max_distance, gradient)
+    given = (faces.tree, faces.centers, faces.axes, faces.half, faces.thickness)
+    return torch.ops.lardhm.nearest_face(points.detach(), *given, max_distance, gradient)
 
 
 def descends(indices: Tensor, values: Tensor) -> bool:

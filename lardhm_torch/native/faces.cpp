@@ -1,4 +1,5 @@
-// The nearest of many flat faces, as `faces.py` defines them: a tree of boxes over faces in Morton order.
+// The nearest of many flat faces or plates, as `faces.py` defines them: a tree of boxes over them in
+// Morton order. A plate is a face with a thickness; inside of it the distance is negative.
 //
 // A node holds one register of boxes, a leaf one register of faces. The tree is searched in float32,
 // nearest child first, from a bound that the leaf of the point before gives; the distance and its
@@ -26,9 +27,9 @@ constexpr float kNowhere = 1e18f;  // where the padding lies; its square is fini
 constexpr uint64_t kTreeMagic = 0x3173656361666472ULL;
 
 template <int D>
-struct FaceLayout {  // floats of a face: center, axes, half edges, rounding
+struct FaceLayout {  // floats of a face: center, axes, half edges, rounding, half thickness
   static constexpr int center = 0, axes = D, half = D + D * D, radius = half + D - 1;
-  static constexpr int count = D == 3 ? 16 : 8;
+  static constexpr int thickness = radius + 1, count = 4 * D + (D == 3 ? 4 : 1);
 };
 
 struct TreeHeader {
@@ -62,7 +63,7 @@ struct TreeSections {
 // F faces as the definition stores them, float64.
 template <int D>
 struct FaceArrays {
-  const double *centers, *axes, *half;
+  const double *centers, *axes, *half, *thickness;  // no thickness (null): faces
 
   const double* axis(int64_t face) const { return axes + face * D * D; }
   const double* edges(int64_t face) const { return half + face * (D - 1); }
@@ -71,7 +72,7 @@ struct FaceArrays {
   // How far the face reaches from its center along coordinate d [m].
   double extent(int64_t face, int d) const {
     const double r = radius(face);
-    double sum = 0, squares = 0;
+    double sum = thickness ? std::abs(axis(face)[d * D]) * thickness[face] : 0, squares = 0;
     for (int j = 1; j < D; ++j) {
       const double u = axis(face)[d * D + j];
       sum += std::abs(u) * (edges(face)[j - 1] - r);
@@ -141,6 +142,7 @@ struct TreeBuilder {
     for (int i = 0; i < D * D; ++i) to[L::axes + i] = float(faces.axis(face)[i]);
     for (int j = 0; j < D - 1; ++j) to[L::half + j] = float(faces.edges(face)[j]);
     to[L::radius] = float(faces.radius(face));
+    to[L::thickness] = faces.thickness ? float(faces.thickness[face]) : 0;
   }
 
   // Boxes of the leaves (level 0) or of the nodes one level below.
@@ -221,14 +223,14 @@ inline Simd<float>::V root(Simd<float>::V x) {
 }
 
 // A register of neighboring points on their way through the tree, one a lane.
-template <int D>
+template <int D, bool Solid>
 struct Packet {
   using V = Simd<float>::V;
   using I = Simd<float>::I;
   const Tree<D>& tree;
   V x[D];
-  V best;         // [m^2] squared distance of the nearest face so far
-  I found;        // its rank
+  V best;   // [m^2] squared distance of the nearest face so far; negative inside of a plate
+  I found;  // its rank
   float low[D], high[D];
 
   explicit Packet(const Tree<D>& tree_) : tree(tree_) {}
@@ -250,20 +252,31 @@ struct Packet {
     for (int j = 0; j < D; ++j) {
       V u = offset[0] * at[L::axes + j];
       for (int d = 1; d < D; ++d) u += offset[d] * at[L::axes + d * D + j];
-      edge[j] = j ? absolute(u) - at[L::half + j - 1] : u;
-      const V outside = j ? positive(edge[j]) : u;
+      edge[j] = u;
+      if (j) edge[j] = absolute(u) - at[L::half + j - 1];
+      if (Solid && !j) edge[j] = absolute(u) - at[L::thickness];
+      const V outside = j || Solid ? positive(edge[j]) : edge[j];
       lower += outside * outside;
     }
-    if (!bits_of<float>(lower < best)) return;
+    if (!bits_of<float>(or_inside(lower) < best)) return;
     V squares{};
     for (int j = 1; j < D; ++j) {
       const V beyond = positive(edge[j] + at[L::radius]);
       squares += beyond * beyond;
     }
-    const V beside = positive(root(squares) - at[L::radius]);
-    const V distance = edge[0] * edge[0] + beside * beside;
+    const V side = root(squares) - at[L::radius], beside = positive(side);
+    V distance = edge[0] * edge[0] + beside * beside;
+    if (Solid) {
+      const V above = positive(edge[0]), inside = edge[0] > side ? edge[0] : side;
+      distance = inside > 0 ? above * above + beside * beside : -(inside * inside);
+    }
     found = distance < best ? I{} + int32_t(rank) : found;
     best = distance < best ? distance : best;
+  }
+
+  // Bounds of squared distances: inside of a box there may be the inside of a plate.
+  static V or_inside(V squared) {
+    return Solid ? (squared > 0 ? squared : V{} - std::numeric_limits<float>::max()) : squared;
   }
 
   void visit(int64_t level, int64_t node) {
@@ -274,10 +287,11 @@ struct Packet {
       const V outside = positive(below > above ? below : above);
       near += outside * outside;
     }
+    near = or_inside(near);
     for (;;) {
       const float least = smallest_lane<float>(near), worst = -smallest_lane<float>(-best);
       if (!(least < worst)) return;
-      const int lane = __builtin_ctz(bits_le<I>((I)near, (I)(V{} + least)));
+      const int lane = __builtin_ctz(bits_of<float>(near == least));
       near[lane] = std::numeric_limits<float>::infinity();
       if (!reaches(at + lane)) continue;
       const int64_t child = node * kFan + lane;
@@ -299,16 +313,16 @@ struct Packet {
       const V outside = positive(below > above ? below : above);
       near += outside * outside;
     }
-    return bits_of<float>(near < best) != 0;
+    return bits_of<float>(or_inside(near) < best) != 0;
   }
 };
 
-// Signed distance to one face, float64, and its gradient where asked.
+// Signed distance to one face or plate, float64, and its gradient where asked.
 template <int D>
 double exact(const FaceArrays<D>& faces, int64_t face, const double* point, double* gradient) {
   const double* axes = faces.axis(face);
   const double radius = faces.radius(face);
-  double u[D] = {}, beyond[D] = {}, squares = 0;
+  double u[D] = {}, beyond[D] = {}, slope[D] = {}, squares = 0;
   for (int d = 0; d < D; ++d) {
     const double offset = point[d] - faces.centers[face * D + d];
     for (int j = 0; j < D; ++j) u[j] += offset * axes[d * D + j];
@@ -317,20 +331,35 @@ double exact(const FaceArrays<D>& faces, int64_t face, const double* point, doub
     beyond[j] = std::max(std::abs(u[j]) - (faces.edges(face)[j - 1] - radius), 0.0);
     squares += beyond[j] * beyond[j];
   }
-  const double length = std::sqrt(squares), beside = std::max(length - radius, 0.0);
-  const double distance = std::sqrt(u[0] * u[0] + beside * beside);
-  const double sign = -u[0] > beside ? -1.0 : 1.0;
+  const double length = std::sqrt(squares), side = length - radius;
+  double height = u[0], up = 1, value;
+  if (faces.thickness) {
+    height = std::abs(u[0]) - faces.thickness[face];
+    up = std::copysign(1.0, u[0]);
+  }
+  double part[2];  // of the height and of what is beside in the gradient
+  if (faces.thickness && std::max(height, side) <= 0) {
+    value = std::max(height, side);
+    part[0] = height >= side, part[1] = height < side;
+  } else if (side > 0 && !(faces.thickness && height <= 0)) {
+    const double sign = !faces.thickness && -height > side ? -1.0 : 1.0;
+    const double distance = std::sqrt(height * height + side * side);
+    value = sign * distance;
+    part[0] = sign * height / distance, part[1] = sign * side / distance;
+  } else {
+    value = side > 0 ? side : height;
+    part[0] = side <= 0, part[1] = side > 0;
+  }
   if (gradient) {
-    double slope[D];
-    slope[0] = beside > 0 ? sign * u[0] / distance : 1.0;
+    slope[0] = part[0] * up;
     for (int j = 1; j < D; ++j)
-      slope[j] = beside > 0 ? sign * beside / distance * std::copysign(beyond[j] / length, u[j]) : 0;
+      slope[j] = length > 0 ? part[1] * std::copysign(beyond[j] / length, u[j]) : 0.0;
     for (int d = 0; d < D; ++d) {
       gradient[d] = 0;
       for (int j = 0; j < D; ++j) gradient[d] += axes[d * D + j] * slope[j];
     }
   }
-  return beside > 0 ? sign * distance : u[0];
+  return value;
 }
 
 // Answers for some points, in the order of a Z curve: a packet begins with the face of the one before.
@@ -344,8 +373,14 @@ struct Answer {
   int64_t* nearest;
 
   void run(int64_t begin, int64_t end) const {
-    std::vector<int64_t> rows = sorted_rows(begin, end);
-    Packet<D> packet(tree);
+    faces.thickness ? search<true>(begin, end) : search<false>(begin, end);
+  }
+
+ private:
+  template <bool Solid>
+  void search(int64_t begin, int64_t end) const {
+    const std::vector<int64_t> rows = sorted_rows(begin, end);
+    Packet<D, Solid> packet(tree);
     int64_t last = 0;
     for (int64_t i = 0; i < int64_t(rows.size()); i += kFan) {
       const int lanes = int(std::min<int64_t>(kFan, int64_t(rows.size()) - i));
@@ -354,7 +389,7 @@ struct Answer {
         const double* point = points + rows[i + std::min(lane, lanes - 1)] * D;
         for (int d = 0; d < D; ++d) x[d][lane] = float(point[d] - tree.header.base[d]);
       }
-      for (int d = 0; d < D; ++d) packet.x[d] = load<typename Packet<D>::V>(x[d]);
+      for (int d = 0; d < D; ++d) packet.x[d] = load<Simd<float>::V>(x[d]);
       packet.start(float(max_distance * max_distance * (1 + 1e-6)));
       if (tree.header.faces) {
         packet.look_at(last);
@@ -367,7 +402,6 @@ struct Answer {
     }
   }
 
- private:
   // The finite points along a Z curve; the others are answered at once.
   std::vector<int64_t> sorted_rows(int64_t begin, int64_t end) const {
     Box<double, D> box;
@@ -402,26 +436,31 @@ struct Answer {
     const int64_t face = tree.order[rank];
     const double value =
         exact<D>(faces, face, points + row * D, gradients ? gradients + row * D : nullptr);
-    const bool is_near = std::abs(value) < max_distance;
+    const bool is_near = (faces.thickness ? value : std::abs(value)) < max_distance;
     set(row, is_near ? value : max_distance, is_near ? face : -1);
   }
 };
 
-void check_faces(const Tensor& centers, const Tensor& axes, const Tensor& half) {
+void check_faces(const Tensor& centers, const Tensor& axes, const Tensor& half,
+                 const Tensor& thickness) {
   const int64_t count = centers.size(0), dim = centers.size(1);
   check(centers.dim() == 2 && (dim == 2 || dim == 3), "centers must be (F, 2) or (F, 3)");
   check(axes.dim() == 3 && axes.size(0) == count && axes.size(1) == dim && axes.size(2) == dim,
         "axes must be (F, D, D)");
   check(half.dim() == 2 && half.size(0) == count && half.size(1) == dim - 1,
         "half must be (F, D - 1)");
-  for (const Tensor* t : {&centers, &axes, &half})
+  check(thickness.dim() == 1 && (thickness.size(0) == 0 || thickness.size(0) == count),
+        "thickness must be (F,), or (0,) for faces");
+  for (const Tensor* t : {&centers, &axes, &half, &thickness})
     check(t->scalar_type() == ScalarType::Double, "faces must be float64");
   check(count < (int64_t(1) << 30), "faces must be fewer than 2^30");
 }
 
 template <int D>
-FaceArrays<D> arrays_of(const Tensor& centers, const Tensor& axes, const Tensor& half) {
-  return {in<double>(centers), in<double>(axes), in<double>(half)};
+FaceArrays<D> arrays_of(const Tensor& centers, const Tensor& axes, const Tensor& half,
+                        const Tensor& thickness) {
+  return {in<double>(centers), in<double>(axes), in<double>(half),
+          thickness.size(0) ? in<double>(thickness) : nullptr};
 }
 
 template <class Use>
@@ -429,11 +468,13 @@ auto by_dimension(int64_t dim, const Use& use) {
   return dim == 2 ? use(std::integral_constant<int, 2>{}) : use(std::integral_constant<int, 3>{});
 }
 
-Tensor face_tree(const Tensor& given_centers, const Tensor& given_axes, const Tensor& given_half) {
+Tensor face_tree(const Tensor& given_centers, const Tensor& given_axes, const Tensor& given_half,
+                 const Tensor& given_thickness) {
   const Tensor centers = tidy(given_centers), axes = tidy(given_axes), half = tidy(given_half);
-  check_faces(centers, axes, half);
+  const Tensor thickness = tidy(given_thickness);
+  check_faces(centers, axes, half, thickness);
   return by_dimension(centers.size(1), [&](auto dim) {
-    const auto faces = arrays_of<dim()>(centers, axes, half);
+    const auto faces = arrays_of<dim()>(centers, axes, half, thickness);
     const TreeBuilder<dim()> builder(faces, centers.size(0));
     const Tensor bytes =
         torch::stable::new_empty(centers, {builder.header.bytes}, ScalarType::Byte);
@@ -444,10 +485,12 @@ Tensor face_tree(const Tensor& given_centers, const Tensor& given_axes, const Te
 
 std::tuple<Tensor, Tensor, Tensor> nearest_face(
     const Tensor& given_points, const Tensor& given_tree, const Tensor& given_centers,
-    const Tensor& given_axes, const Tensor& given_half, double max_distance, bool gradient) {
+    const Tensor& given_axes, const Tensor& given_half, const Tensor& given_thickness,
+    double max_distance, bool gradient) {
   const Tensor points = tidy(given_points), tree = tidy(given_tree);
   const Tensor centers = tidy(given_centers), axes = tidy(given_axes), half = tidy(given_half);
-  check_faces(centers, axes, half);
+  const Tensor thickness = tidy(given_thickness);
+  check_faces(centers, axes, half, thickness);
   check_rows("points", points, centers);
   const int64_t n = points.size(0), dim = points.size(1);
   TreeHeader header{};
@@ -462,7 +505,7 @@ std::tuple<Tensor, Tensor, Tensor> nearest_face(
   const Tensor slopes = torch::stable::new_empty(points, {gradient ? n : 0, dim});
   const Tensor nearest = torch::stable::new_empty(points, {n}, ScalarType::Long);
   by_dimension(dim, [&](auto d) {
-    const auto faces = arrays_of<d()>(centers, axes, half);
+    const auto faces = arrays_of<d()>(centers, axes, half, thickness);
     const Tree<d()> search(in<char>(tree));
     const Answer<d()> answer{in<double>(points), search, faces, max_distance, out<double>(values),
                              gradient ? out<double>(slopes) : nullptr, out<int64_t>(nearest)};
@@ -479,10 +522,10 @@ std::tuple<Tensor, Tensor, Tensor> nearest_face(
 }  // namespace lardhm
 
 STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def("face_tree(Tensor centers, Tensor axes, Tensor half) -> Tensor");
+  m.def("face_tree(Tensor centers, Tensor axes, Tensor half, Tensor thickness) -> Tensor");
   m.def(
       "nearest_face(Tensor points, Tensor tree, Tensor centers, Tensor axes, Tensor half, "
-      "float max_distance, bool gradient) -> (Tensor, Tensor, Tensor)");
+      "Tensor thickness, float max_distance, bool gradient) -> (Tensor, Tensor, Tensor)");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {

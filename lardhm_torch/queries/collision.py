@@ -1,4 +1,4 @@
-"""Collision probability along straight segments, expected range of rays, and clearance."""
+"""Collision probability along straight segments, and expected range of rays."""
 
 from __future__ import annotations
 
@@ -8,13 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, num_neighbors, to_tensor
-from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, to_tensor
 from lardhm_torch.queries.hazard import HAZARD_LENGTH, survival, swept_integral
 from lardhm_torch.queries.raycasting import surface_step, unit_rays
-
-CHUNK_PAIRS = 1 << 21  # pairs of a point and a cluster at a time
-MIN_THRESHOLD = 1 / (1 + math.e)  # log-odds of -1: `EVIDENCE` above it is unknown space
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,52 +150,3 @@ def _expected_range(
     divisor = torch.where(small, 1.0, expected)
     within = torch.where(small, 1 - expected / 2, -torch.expm1(-expected) / divisor)
     return (survival(expected) * within).sum(dim=1) * (max_range / count)
-
-
-def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -> Tensor:
-    """Lower bound on the distance to the nearest obstacle; differentiable.
-
-    An obstacle is where the log-odds exceed those of the threshold by `EVIDENCE`, as for `raycast`.
-    At most k clusters contribute there, so one of them contributes at least the k-th part. The
-    obstacle therefore lies in the ellipsoid |inv(L) (x - c)| <= E of a cluster of positive weight w,
-    with E = sqrt(2 log(k w / log-odds)). The distance to an ellipsoid is at least
-    (|inv(L) (x - c)| - E) times the smallest standard deviation, and at least |x - c| - E times the
-    largest.
-
-    Args:
-        model: the map; a tiled map must fit in memory.
-        points: (..., D) world positions [m].
-        threshold: probability of occupancy that counts as an obstacle, between 0.27 and 1.
-
-    Returns:
-        (...) float64 [m]: at most the distance to the nearest obstacle, and 1-Lipschitz. Negative
-        where an obstacle is possible; infinite if the map has no obstacle.
-
-    Raises:
-        ValueError: threshold is not between 1 / (1 + e) = 0.27 and 1, or points are not (..., D).
-    """
-    if not MIN_THRESHOLD < threshold < 1:
-        raise ValueError(f"threshold must be between 0.27 and 1; got {threshold}")
-    points = to_tensor(points, "points", model.centers.device)
-    if points.ndim == 0 or points.shape[-1] != model.dim:
-        raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
-    target = threshold_log_odds(threshold) + EVIDENCE
-    neighbors = num_neighbors(model)
-    chosen = (model.weights * neighbors > target).nonzero().squeeze(1)
-    flat = points.reshape(-1, model.dim)
-    if len(chosen) == 0:
-        return torch.full_like(flat[:, 0], torch.inf).reshape(points.shape[:-1])
-    radius = (2 * (neighbors * model.weights[chosen].double() / target).log()).sqrt()
-    factors = model.scale_tril[chosen].double()
-    centers = model.centers[chosen].double() + model.origin
-    stds = torch.linalg.svdvals(factors)
-    eye = torch.eye(model.dim, dtype=torch.float64, device=flat.device)
-    whiten = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)
-    distances = [flat.new_zeros(0)]
-    for chunk in flat.split(max(1, CHUNK_PAIRS // len(chosen))):
-        offsets = chunk[:, None] - centers
-        whitened = torch.einsum("mij,nmj->nmi", whiten, offsets)
-        by_shortest = (torch.linalg.vector_norm(whitened, dim=2) - radius) * stds[:, -1]
-        by_longest = torch.linalg.vector_norm(offsets, dim=2) - radius * stds[:, 0]
-        distances.append(torch.maximum(by_shortest, by_longest).amin(dim=1))
-    return torch.cat(distances).reshape(points.shape[:-1])

@@ -79,7 +79,7 @@ def surface_distance(
 
 def _distances(model: OccupancyMap, points: Tensor, max_distance: float) -> Tensor:
     """(N,) signed distances of (N, D) float64 world positions."""
-    result = _Distance.apply(points - model.origin, surface_faces(model), max_distance)
+    result = to_nearest(points - model.origin, surface_faces(model), max_distance)
     behind = (result.detach() < 0).nonzero().squeeze(1)
     if len(behind) == 0:
         return result
@@ -122,6 +122,17 @@ def _far_ends(model: OccupancyMap) -> tuple[Tensor, Tensor] | None:
     return (lower.amin(dim=0), upper.amax(dim=0)) if len(lower) else None
 
 
+def to_nearest(points: Tensor, faces: Faces, max_distance: float) -> Tensor:
+    """(N,) signed distances of (N, D) points in the map's frame to the nearest face or plate.
+
+    Args:
+        points: (N, D) float64 positions [m].
+        faces: all in one frame.
+        max_distance: result where none is nearer [m].
+    """
+    return _Distance.apply(points, faces, max_distance)
+
+
 class _Distance(torch.autograd.Function):
     """Signed distances of (N, D) float64 points in the map's frame to the nearest faces."""
 
@@ -150,15 +161,23 @@ class _Distance(torch.autograd.Function):
         return slope, None, None
 
 
-@torch.no_grad()
 def nearest_faces(points: Tensor, faces: Faces, max_distance: float) -> Tensor:
     """(N,) nearest face of each (N, D) point, -1 where none is nearer than ``max_distance``."""
+    if native.has_tree(faces.tree):
+        return native.nearest_face(points, faces, max_distance, False)[2]
+    return plain_nearest(points, faces, max_distance)
+
+
+@torch.no_grad()
+def plain_nearest(points: Tensor, faces: Faces, max_distance: float) -> Tensor:
+    """The definition of `nearest_faces`: the first of the smallest distances to all faces."""
     count = len(faces.centers)
     result = torch.full((len(points),), -1, dtype=torch.long, device=points.device)
     for rows in _chunks(points, count):
         some = points[rows]
         every = torch.arange(count, device=points.device).expand(len(some), -1)
-        values = _to_faces(some[:, None], faces, every).abs()
+        values = _to_faces(some[:, None], faces, every)
+        values = values if len(faces.thickness) else values.abs()
         least = values.nan_to_num(torch.inf).min(dim=1)
         result[rows] = torch.where(least.values < max_distance, least.indices, -1)
     return result
@@ -182,23 +201,31 @@ def face_distances(points: Tensor, faces: Faces, nearest: Tensor, max_distance: 
 
 
 def _to_faces(points: Tensor, faces: Faces, which: Tensor) -> Tensor:
-    """(...) signed distances of (..., D) points, broadcast, to (...) faces [m].
+    """(...) signed distances of (..., D) points, broadcast, to (...) faces or plates [m].
 
     With the height z over a face and the distance rho beside its rounded rectangle, the distance is
-    sqrt(z^2 + rho^2). It is negative where the point lies below the face by more than rho.
+    sqrt(z^2 + rho^2). It is negative where the point lies below the face by more than rho. For a
+    plate, z is the height over either side; inside, the distance is max(z, rho), both negative.
     """
+    height, side = height_and_side(points, faces, which)
+    is_plate = len(faces.thickness) > 0
+    if is_plate:
+        height = height.abs() - faces.thickness[which]
+    is_off = (side > 0) & (height > 0) if is_plate else side > 0
+    away = torch.where(is_off, height.square() + side.square(), 1.0).sqrt()
+    if is_plate:
+        return torch.where(is_off, away, torch.maximum(height, side))
+    return torch.where(is_off, torch.where(-height > side, -away, away), height)
+
+
+def height_and_side(points: Tensor, faces: Faces, which: Tensor) -> tuple[Tensor, Tensor]:
+    """(...) heights of (..., D) points over (...) faces, and signed distances beside them [m]."""
     u = torch.einsum("...d,...de->...e", points - faces.centers[which], faces.axes[which])
-    height = u[..., 0]
     if u.shape[-1] == 1:
-        return height
+        return u[..., 0], torch.full_like(u[..., 0], -torch.inf)
     half = faces.half[which]
     radius = half.amin(dim=-1)
     beyond = (u[..., 1:].abs() - (half - radius[..., None])).clamp(min=0)
     squares = beyond.square().sum(dim=-1)
-    is_off = squares > radius.square()
-    length = torch.where(is_off, squares, 1.0).sqrt()
-    beside = torch.where(is_off, length - radius, 0.0)
-    away = torch.where(is_off, height.square() + beside.square(), 1.0).sqrt()
-    away = torch.where(is_off, away, height.abs())
-    value = torch.where(is_off, away, height)
-    return torch.where(is_off & (-height > beside), -away, value)
+    length = torch.where(squares > 0, torch.where(squares > 0, squares, 1.0).sqrt(), 0.0)
+    return u[..., 0], length - radius

@@ -37,12 +37,14 @@ class Faces:
         centers: (F, D) float64, map frame [m].
         axes: (F, D, D) float64 orthonormal columns: the normal, into free space, then the edges.
         half: (F, D - 1) float64 half edges [m].
+        thickness: (F,) float64 half thickness of plates [m]; (0,) for faces, which have a front.
         tree: of the native search; empty where it is not available.
     """
 
     centers: Tensor
     axes: Tensor
     half: Tensor
+    thickness: Tensor
     tree: Tensor
 
 
@@ -199,4 +201,10 @@ def _faces_of(plates: _Plates) -> Faces:
         centers = plates.centers[rows] + plates.half[rows, :1] * axes[:, :, 0]
         parts.append((centers, axes, plates.half[rows, 1:]))
     centers, axes, half = (torch.cat(column).contiguous() for column in zip(*parts, strict=True))
-    return Faces(centers, axes, half, native.face_tree(centers, axes, half))
+    return with_tree(centers, axes, half, centers.new_zeros(0))
+
+
+def with_tree(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Faces:
+    """Faces, or plates, with a tree to search them."""
+    given = (centers, axes, half, thickness)
+    return Faces(*given, native.face_tree(*given))
