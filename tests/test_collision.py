@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_maps import GaussianMap, ball, random_map
 
-from lardhm_torch import LardHilbertMap, load_scans, sample_rays
+from lardhm_torch import LardHilbertMap, load_scans, sample_rays, simulate_room
+from lardhm_torch.queries import marching
 from lardhm_torch.queries.clearance import clearance
 from lardhm_torch.queries.collision import (
     Mover,
@@ -123,6 +124,45 @@ def test_the_expected_range_is_the_integral_of_the_chance_to_get_so_far():
     assert float(found) == pytest.approx(float(expected), abs=1e-3)
     away = expected_range(model, start, -toward, 5.0)
     assert float(away) == pytest.approx(5.0, abs=1e-6)
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=st.integers(0, 2**31 - 1), step=st.floats(0.01, 3.0), radius=st.sampled_from([0, 0.2]))
+def test_hazards_are_never_negative_and_probabilities_never_above_one(seed, step, radius):
+    model, mover = random_map(seed, clusters=3), Mover(radius=radius, step=step)
+    starts, ends = 3 * torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(seed)).double()
+    assert (segment_hazard(model, starts, ends, mover) >= 0).all()
+    probability = free_probability(model, starts, ends, mover)
+    assert ((probability >= 0) & (probability <= 1)).all()
+    ranges = expected_range(model, starts, ends - starts, 2.0, mover)
+    assert ((ranges >= 0) & (ranges <= 2 + 1e-12)).all()
+
+
+def test_a_sphere_s_expected_range_follows_from_the_hazard_of_its_segments():
+    model, mover = ball(weight=2.0, sigma=0.5), Mover(radius=0.5, step=0.02, length=1.0)
+    start, toward = (
+        torch.tensor([-3.0, 0.0, 0.0]).double(),
+        torch.tensor([[1.0, 0.0, 0.0]]).double(),
+    )
+    depth = torch.linspace(0, 6, 201, dtype=torch.float64)[:, None]
+    ends = start + depth * toward / toward.norm()
+    hazards = segment_hazard(model, start.expand_as(ends), ends, mover)
+    assert float(hazards[-1]) > 0.5
+    expected = torch.trapezoid(torch.exp(-hazards), depth[:, 0])
+    found = expected_range(model, start, toward, 6.0, mover)
+    assert float(found) == pytest.approx(float(expected), abs=2e-3)
+
+
+def test_the_native_march_passes_over_no_hazard(monkeypatch):
+    samples = sample_rays(simulate_room(3000))
+    model = LardHilbertMap().fit(samples.points, samples.labels).requires_grad_(False)
+    starts = torch.tensor([4.4, 2.8, 1.1]).double()
+    toward = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).double()
+    found = expected_range(model, starts, toward, 6.0)
+    monkeypatch.setattr(marching, "native_ranges", lambda *_: None)
+    expected = expected_range(model, starts, toward, 6.0)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-2)
+    assert float((found - expected).abs().median()) < 1e-4
 
 
 @pytest.mark.parametrize(

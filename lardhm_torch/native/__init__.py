@@ -129,7 +129,8 @@ def raycast(
     Args:
         rays: (R, D) origins in the map's frame and (R, D) directions of length 1, float64 [m].
         march: step and largest range [m], log-odds of the threshold and of a clear obstacle, and
-            whether to go on to the ridge.
+            whether to go on to the ridge; where both log-odds are equal, the first step above
+            them is the answer.
         parameters: centers, raw factors, weights of the map.
         kernel: its settings.
         index: of the centers.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, to_tensor
-from lardhm_torch.queries.hazard import HAZARD_LENGTH, survival, swept_integral
+from lardhm_torch.queries.hazard import HAZARD_LENGTH, sphere_points, swept_integral
+from lardhm_torch.queries.marching import Rays, march
 from lardhm_torch.queries.raycasting import surface_step, unit_rays
 
 
@@ -110,8 +111,8 @@ def expected_range(
     """Expected range of each ray; differentiable.
 
     E[min(range, max_range)] = integral of exp(-Lambda(t)) from 0 to max_range, where Lambda(t) is
-    the integral of the hazard up to t. It is exact at the ends of the steps and taken as linear
-    within them.
+    the hazard up to t, as `segment_hazard` has it, by the trapezoidal rule. Probabilities below
+    0.0001 count as 0.
 
     Args:
         model: the map.
@@ -128,25 +129,14 @@ def expected_range(
     """
     mover = mover or Mover()
     starts, headings = unit_rays(model, origins, directions, max_range, mover.step)
-    ranges, ends = starts.new_zeros(len(starts)), starts + max_range * headings
-    mover = replace(mover, step=surface_step(model) if mover.step is None else mover.step)
-    for rows, part in local_parts(model, starts.minimum(ends), starts.maximum(ends)):
-        expected = _expected_range(part, starts[rows], headings[rows], max_range, mover)
-        ranges = ranges.index_copy(0, rows, expected)
-    return ranges
-
-
-def _expected_range(
-    model: OccupancyMap, origins: Tensor, directions: Tensor, max_range: float, mover: Mover
-) -> Tensor:
-    """(R,) expected ranges by a map held in memory [m]."""
-    count = math.ceil(max_range / (mover.step or max_range))
-    edges = torch.linspace(0, max_range, count + 1, dtype=torch.float64, device=origins.device)
-    points = origins[:, None] + edges[:, None] * directions[:, None]  # (R, count + 1, D)
-    starts, ends = (part.reshape(-1, model.dim) for part in (points[:, :-1], points[:, 1:]))
-    expected = segment_hazard(model, starts, ends, mover).reshape(-1, count)
-    # mean of exp(-Lambda) within a step, relative to its start: (1 - exp(-h)) / h
-    small = expected < 1e-4
-    divisor = torch.where(small, 1.0, expected)
-    within = torch.where(small, 1 - expected / 2, -torch.expm1(-expected) / divisor)
-    return (survival(expected) * within).sum(dim=1) * (max_range / count)
+    ends = starts + max_range * headings
+    ranges = starts.new_zeros(len(starts))
+    step = min(surface_step(model) if mover.step is None else mover.step, max_range)
+    body = sphere_points(model.dim, mover.radius).to(starts.device)
+    lower, upper = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
+    for rows, part in local_parts(model, lower.detach(), upper.detach()):
+        rays = Rays(starts[rows], headings[rows], max_range, step, mover.length, body)
+        for steps in march(part, rays):
+            gone = steps.skipped + (steps.reached * steps.widths).sum(dim=1)
+            ranges = ranges.index_add(0, rows[steps.rows], gone)
+    return ranges.clamp(max=max_range)
