@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, TensorLike, num_neighbors, to_tensor
 from lardhm_torch.queries.distance import height_and_side, nearest_faces, to_nearest
-from lardhm_torch.queries.faces import Faces, surface_faces, with_tree
+from lardhm_torch.queries.faces import Faces, plates_of, surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
 
 MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
@@ -91,7 +91,7 @@ def _ellipsoids(model: OccupancyMap, target: float) -> Faces:
     axes, stds = axes.flip(2).contiguous(), stds.flip(1)  # the thinnest axis first
     extents = stds * (2 * (most * weights[rows] / target).log()).sqrt()[:, None]
     centers = model.centers.detach()[rows].double()
-    return with_tree(centers, axes, extents[:, 1:].contiguous(), extents[:, 0].contiguous())
+    return plates_of(centers, axes, extents[:, 1:].contiguous(), extents[:, 0].contiguous())
 
 
 def _around_surfaces(model: OccupancyMap, ellipsoids: Faces, target: float) -> Faces:
@@ -128,4 +128,4 @@ def _around_surfaces(model: OccupancyMap, ellipsoids: Faces, target: float) -> F
     plates = (centers, faces.axes, faces.half + beside[:, None], (before + behind) / 2)
     others = (ellipsoids.centers, ellipsoids.axes, ellipsoids.half, ellipsoids.thickness)
     parts = zip(plates, others, strict=True)
-    return with_tree(*(torch.cat([ours, theirs[lonely]]) for ours, theirs in parts))
+    return plates_of(*(torch.cat([ours, theirs[lonely]]) for ours, theirs in parts))

@@ -20,7 +20,11 @@ FIRST_REACH = 4.0  # [m] how far a tiled map looks first
 
 
 def signed_distance(
-    model: OccupancyMap, points: TensorLike, max_distance: float = math.inf
+    model: OccupancyMap,
+    points: TensorLike,
+    max_distance: float = math.inf,
+    *,
+    to_mean: bool = False,
 ) -> Tensor:
     """Distance to the nearest surface, negative behind it; differentiable in the points.
 
@@ -30,6 +34,10 @@ def signed_distance(
     only. A face seen obliquely from behind, from farther beside than below it, counts as seen from
     its front.
 
+    Faces lie one standard deviation of the hits in front of their mean, because the nearest of noisy
+    hits is in front of the surface. With ``to_mean`` the distance is greater by that: without bias
+    where the noise is that of the sensor.
+
     Unlike `clearance`, this is an estimate, not a bound. The gradient has length 1, and is 0 where
     nothing is nearer than ``max_distance``.
 
@@ -37,6 +45,7 @@ def signed_distance(
         model: the map.
         points: (..., D) world positions [m].
         max_distance: result where no surface is nearer [m]; a finite one saves time.
+        to_mean: to the mean of the hits instead of to the nearest of them.
 
     Returns:
         (...) distances in the dtype of the points, float64 for arrays and lists [m]; NaN for a
@@ -54,11 +63,8 @@ def signed_distance(
     if points.ndim == 0 or points.shape[-1] != model.dim:
         raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
     flat = points.reshape(-1, model.dim)
-    if not hasattr(model, "local_parts"):
-        result = _distances(model, flat, max_distance)
-    else:
-        result = _in_parts(model, flat, max_distance)
-    return result.reshape(points.shape[:-1]).to(dtype)
+    ask = _in_parts if hasattr(model, "local_parts") else _distances
+    return ask(model, flat, max_distance, to_mean).reshape(points.shape[:-1]).to(dtype)
 
 
 def surface_distance(
@@ -77,18 +83,21 @@ def surface_distance(
     return signed_distance(model, points, max_distance).abs()
 
 
-def _distances(model: OccupancyMap, points: Tensor, max_distance: float) -> Tensor:
+def _distances(model: OccupancyMap, points: Tensor, max_distance: float, to_mean: bool) -> Tensor:
     """(N,) signed distances of (N, D) float64 world positions."""
-    result = to_nearest(points - model.origin, surface_faces(model), max_distance)
+    faces = surface_faces(model)
+    result, nearest = _Distance.apply(points - model.origin, faces, max_distance)
     behind = (result.detach() < 0).nonzero().squeeze(1)
-    if len(behind) == 0:
-        return result
-    with torch.no_grad():
-        is_free = model.log_odds(points.detach()[behind]) < -EVIDENCE
-    return result * torch.ones_like(result).index_fill_(0, behind[is_free], -1.0)
+    if len(behind):
+        with torch.no_grad():
+            is_free = model.log_odds(points.detach()[behind]) < -EVIDENCE
+        result = result * torch.ones_like(result).index_fill_(0, behind[is_free], -1.0)
+    if to_mean and len(faces.noise):
+        result = result + torch.where(nearest >= 0, faces.noise[nearest.clamp(min=0)], 0.0)
+    return result
 
 
-def _in_parts(model: OccupancyMap, points: Tensor, max_distance: float) -> Tensor:
+def _in_parts(model: OccupancyMap, points: Tensor, max_distance: float, to_mean: bool) -> Tensor:
     """The same for a tiled map, which looks farther and farther for what is not near."""
     result = points.new_full((len(points),), max_distance)
     result = result + 0 * points.detach().sum(dim=1)  # NaN where a point is not finite
@@ -107,7 +116,7 @@ def _in_parts(model: OccupancyMap, points: Tensor, max_distance: float) -> Tenso
         )
         found = some.new_full((len(left),), torch.inf)
         for rows, part in local_parts(model, lower, upper):
-            found = found.index_copy(0, rows, _distances(part, some[rows], most))
+            found = found.index_copy(0, rows, _distances(part, some[rows], most, to_mean))
         near = found.detach().abs() < most
         result = result.index_copy(0, left[near], found[near])
         covered = ((lower <= ends[0]) & (upper >= ends[1])).all(dim=1)
@@ -130,14 +139,16 @@ def to_nearest(points: Tensor, faces: Faces, max_distance: float) -> Tensor:
         faces: all in one frame.
         max_distance: result where none is nearer [m].
     """
-    return _Distance.apply(points, faces, max_distance)
+    return _Distance.apply(points, faces, max_distance)[0]
 
 
 class _Distance(torch.autograd.Function):
-    """Signed distances of (N, D) float64 points in the map's frame to the nearest faces."""
+    """Signed distances of (N, D) float64 points in the map's frame, and their nearest faces."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, faces: Faces, max_distance: float) -> Tensor:
+    def forward(
+        ctx: Any, points: Tensor, faces: Faces, max_distance: float
+    ) -> tuple[Tensor, Tensor]:
         wanted = ctx.needs_input_grad[0]
         if native.has_tree(faces.tree):
             values, gradients, nearest = native.nearest_face(points, faces, max_distance, wanted)
@@ -147,10 +158,11 @@ class _Distance(torch.autograd.Function):
             values = face_distances(points, faces, nearest, max_distance)
             ctx.save_for_backward(points, None, nearest)
         ctx.faces, ctx.max_distance = faces, max_distance
-        return values
+        ctx.mark_non_differentiable(nearest)
+        return values, nearest
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:
+    def backward(ctx: Any, grad: Tensor, _: Any) -> Any:
         points, gradients, nearest = ctx.saved_tensors
         if gradients is not None and not torch.is_grad_enabled():
             return grad[:, None] * gradients, None, None

@@ -38,6 +38,7 @@ class Faces:
         axes: (F, D, D) float64 orthonormal columns: the normal, into free space, then the edges.
         half: (F, D - 1) float64 half edges [m].
         thickness: (F,) float64 half thickness of plates [m]; (0,) for faces, which have a front.
+        noise: (F,) float64 standard deviation of the hits across a face [m]; (0,) for plates.
         tree: of the native search; empty where it is not available.
     """
 
@@ -45,6 +46,7 @@ class Faces:
     axes: Tensor
     half: Tensor
     thickness: Tensor
+    noise: Tensor
     tree: Tensor
 
 
@@ -199,12 +201,14 @@ def _faces_of(plates: _Plates) -> Faces:
         axes = plates.axes[rows].clone()
         axes[:, :, 0] *= side
         centers = plates.centers[rows] + plates.half[rows, :1] * axes[:, :, 0]
-        parts.append((centers, axes, plates.half[rows, 1:]))
-    centers, axes, half = (torch.cat(column).contiguous() for column in zip(*parts, strict=True))
-    return with_tree(centers, axes, half, centers.new_zeros(0))
+        parts.append((centers, axes, plates.half[rows, 1:], plates.half[rows, 0]))
+    centers, axes, half, noise = (torch.cat(column) for column in zip(*parts, strict=True))
+    nothing = noise[:0]
+    tree = native.face_tree(centers, axes, half, nothing)
+    return Faces(centers, axes, half, nothing, noise, tree)
 
 
-def with_tree(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Faces:
-    """Faces, or plates, with a tree to search them."""
+def plates_of(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Faces:
+    """Plates, which have a thickness, with a tree to search them."""
     given = (centers, axes, half, thickness)
-    return Faces(*given, native.face_tree(*given))
+    return Faces(*given, thickness[:0], native.face_tree(*given))
