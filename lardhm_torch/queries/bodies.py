@@ -146,7 +146,9 @@ def _least_of(model: OccupancyMap, starts: Tensor, ends: Tensor, fractions: Tens
     return fractions.gather(1, least).squeeze(1)
 
 
-def collision_probability(model: OccupancyMap, points: TensorLike, radii: TensorLike | float) -> Tensor:
+def collision_probability(
+    model: OccupancyMap, points: TensorLike, radii: TensorLike | float
+) -> Tensor:
     """Probability that the nearest surface is nearer than a radius; differentiable.
 
     P(distance < r) = Phi((r - m) / s), where m is the `signed_distance` to the mean of the hits and
