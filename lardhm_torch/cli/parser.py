@@ -75,6 +75,11 @@ def _fit(sub: argparse.ArgumentParser) -> None:
         help="fine-tune centers, length scales and weights by backpropagation",
     )
     sub.add_argument(
+        "--uncertainty",
+        action="store_true",
+        help="also store the variance of the weights, for colors by variance",
+    )
+    sub.add_argument(
         "--tune-state",
         metavar="FILE",
         help="fine-tune, write a checkpoint to FILE after every epoch, and resume from it if it "

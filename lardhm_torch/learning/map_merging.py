@@ -101,9 +101,9 @@ def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
     return center
 
 
-def within(state: MapState, center: Tensor, radius: float) -> MapState:
-    """The clusters whose centers are within ``radius`` [m] of a position in the map frame."""
-    return state.rows(torch.linalg.vector_norm(state.centers - center, dim=1) <= radius)
+def within(centers: Tensor, center: Tensor, radius: float) -> Tensor:
+    """(M,) mask of the (M, D) centers within ``radius`` [m] of a position in the map frame."""
+    return torch.linalg.vector_norm(centers - center, dim=1) <= radius
 
 
 def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
@@ -113,7 +113,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     their numbers of points; all other clusters are copied. Where the probability of the merged map
     deviates from that of the given maps, its weights are trained on pseudo-samples drawn from both
     maps. Maps that do not overlap are combined unchanged, and merging a map with itself does not
-    change its probabilities.
+    change its probabilities. The posterior of the weights is discarded, because the two maps were
+    calibrated apart (see `LardHilbertMap.fit_uncertainty`).
 
     Args:
         first: a `LardHilbertMap`.

@@ -152,8 +152,8 @@ def collision_probability(
     """Probability that the nearest surface is nearer than a radius; differentiable.
 
     P(distance < r) = Phi((r - m) / s), where m is the `signed_distance` to the mean of the hits and
-    s^2 = (`NOISE_FACTOR` noise)^2 + `ERROR`^2, with the standard deviation of the nearest face's hits
-    as noise. It accounts for what hits say about the surface, not for surfaces never seen.
+    s = sqrt((0.75 noise)^2 + (0.01 m)^2), with the standard deviation of the nearest face's hits as
+    noise. It accounts for what hits say about the surface, not for surfaces never seen.
 
     Args:
         model: the map.
