@@ -21,11 +21,18 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.learning.map_merging import merge_maps as merge_maps
     from lardhm_torch.learning.parameters import resize_optimizer as resize_optimizer
     from lardhm_torch.learning.update import UpdateConfig as UpdateConfig
+    from lardhm_torch.queries.bodies import Body as Body
+    from lardhm_torch.queries.bodies import body_collision_probability as body_collision_probability
+    from lardhm_torch.queries.bodies import body_distance as body_distance
+    from lardhm_torch.queries.bodies import capsule_distance as capsule_distance
+    from lardhm_torch.queries.bodies import collision_probability as collision_probability
+    from lardhm_torch.queries.clearance import clearance as clearance
     from lardhm_torch.queries.collision import Mover as Mover
-    from lardhm_torch.queries.collision import clearance as clearance
     from lardhm_torch.queries.collision import expected_range as expected_range
     from lardhm_torch.queries.collision import free_probability as free_probability
     from lardhm_torch.queries.collision import segment_hazard as segment_hazard
+    from lardhm_torch.queries.distance import signed_distance as signed_distance
+    from lardhm_torch.queries.distance import surface_distance as surface_distance
     from lardhm_torch.queries.exploration import frontiers as frontiers
     from lardhm_torch.queries.exploration import information_gain as information_gain
     from lardhm_torch.queries.grids import grid as grid
@@ -58,13 +65,16 @@ _NAMES = {
     "learning.map_merging": ["merge_maps"],
     "learning.parameters": ["resize_optimizer"],
     "learning.update": ["UpdateConfig"],
-    "queries.collision": [
-        "Mover",
-        "clearance",
-        "expected_range",
-        "free_probability",
-        "segment_hazard",
+    "queries.bodies": [
+        "Body",
+        "body_collision_probability",
+        "body_distance",
+        "capsule_distance",
+        "collision_probability",
     ],
+    "queries.clearance": ["clearance"],
+    "queries.collision": ["Mover", "expected_range", "free_probability", "segment_hazard"],
+    "queries.distance": ["signed_distance", "surface_distance"],
     "queries.exploration": ["frontiers", "information_gain"],
     "queries.grids": ["grid", "query_grid", "query_slice"],
     "queries.raycasting": ["raycast"],

@@ -317,7 +317,7 @@ class LardHilbertMap(parameters.MapParameters):
         """Apply the rigid transform x -> rotation x + translation to the map.
 
         The transform is exact and needs no training, so that a submap can be moved to its new pose
-        after a loop closure.
+        after a loop closure. The posterior of the weights is kept.
 
         Args:
             rotation: (D, D) orthonormal, determinant 1.
@@ -330,7 +330,10 @@ class LardHilbertMap(parameters.MapParameters):
             ValueError: wrong shapes, or rotation is not a rotation.
         """
         state = parameters.read_state(self)
-        parameters.write_state(self, *map_merging.moved(state, self.origin, rotation, translation))
+        moved = map_merging.moved(state, self.origin, rotation, translation)
+        kept = self._copied_posterior(slice(None))
+        parameters.write_state(self, *moved)
+        self.posterior_means, self.posterior_variances, self.posterior_scales = kept
         return self
 
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
@@ -338,6 +341,7 @@ class LardHilbertMap(parameters.MapParameters):
 
         Clusters of surfaces and of unknown space that limit the remaining free space are kept, so that
         places beyond the radius do not become free.
+        The posterior of the other weights is kept.
 
         Returns:
             This map.
@@ -347,9 +351,16 @@ class LardHilbertMap(parameters.MapParameters):
         """
         center = map_merging.check_sphere(center, radius, self.origin)
         state = parameters.read_state(self)
-        state = map_merging.within(state, center - self.origin, radius, self.kernel)
-        parameters.write_state(self, state, self.origin)
+        rows = map_merging.within(state, center - self.origin, radius, self.kernel)
+        kept = self._copied_posterior(rows)
+        parameters.write_state(self, state.rows(rows), self.origin)
+        self.posterior_means, self.posterior_variances, self.posterior_scales = kept
         return self
+
+    def _copied_posterior(self, rows: Tensor | slice) -> tuple[Tensor, Tensor, Tensor]:
+        """Posterior of some weights, which stays valid where these keep their features."""
+        means, variances = self.posterior_means[rows], self.posterior_variances[rows]
+        return means.clone(), variances.clone(), self.posterior_scales.clone()
 
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
         """Parameter groups for an optimizer, with weight decay on the weights only.

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap, sample_rays, simulate_room
-from lardhm_torch.queries.collision import Mover, clearance, free_probability, segment_hazard
+from lardhm_torch.queries.clearance import clearance
+from lardhm_torch.queries.collision import Mover, free_probability, segment_hazard
 from lardhm_torch.queries.grids import query_slice
 
 START, GOAL = (0.8, 1.9), (7.1, 2.4)  # [m]

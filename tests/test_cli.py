@@ -12,7 +12,7 @@ import torch
 import trimesh
 from healthy_files import BagMaker, bag_messages
 
-from lardhm_torch import LardHilbertMap, Scans, load_scans, save_scans
+from lardhm_torch import LardHilbertMap, Scans, load_scans, save_scans, signed_distance
 from lardhm_torch.cli import main
 from lardhm_torch.cli.parser import make_parser
 from lardhm_torch.io.map_files import save_state
@@ -68,6 +68,20 @@ def test_mesh_writes_a_surface(folder, capsys):
 def test_mesh_writes_the_format_of_the_extension(folder, suffix):
     run("mesh", folder / "map.pt", "-o", folder / f"mesh.{suffix}", "--resolution", "0.2")
     assert len(trimesh.load(folder / f"mesh.{suffix}", force="mesh").faces) > 1000
+
+
+def test_grid_writes_distances_and_fit_the_uncertainty(folder, capsys):
+    words = ("grid", folder / "map.pt", "--resolution", "0.5", "--distance")
+    run(*words, "-o", folder / "far.npz")
+    with np.load(folder / "far.npz") as cells:
+        lower = cells["lower"] + 0.5 * cells["resolution"]
+        model = LardHilbertMap.load(folder / "map.pt")
+        assert cells["distance"][0, 0, 0] == pytest.approx(float(signed_distance(model, lower)))
+    assert main([str(word) for word in (*words, "-o", folder / "map.bt")]) != 0
+    assert "--output must end in .npz with --distance" in capsys.readouterr().err
+    run("fit", folder / "train.npz", "--uncertainty", "-o", folder / "unsure.pt")
+    model = LardHilbertMap.load(folder / "unsure.pt")
+    assert (model.posterior_variances > 0).all()
 
 
 def test_grid_writes_probabilities_or_an_octomap(folder, capsys, tmp_path):

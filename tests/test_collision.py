@@ -5,17 +5,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_maps import GaussianMap, ball, radius_where, random_map
+from small_maps import GaussianMap, ball, random_map
 
-from lardhm_torch import LardHilbertMap, load_scans, sample_rays
+from lardhm_torch import LardHilbertMap, load_scans, sample_rays, simulate_room
+from lardhm_torch.queries import marching
+from lardhm_torch.queries.clearance import clearance
 from lardhm_torch.queries.collision import (
     Mover,
-    clearance,
     expected_range,
     free_probability,
     segment_hazard,
 )
-from lardhm_torch.queries.grids import EVIDENCE
 from lardhm_torch.queries.hazard import HAZARD_LENGTH, hazard
 
 
@@ -126,6 +126,45 @@ def test_the_expected_range_is_the_integral_of_the_chance_to_get_so_far():
     assert float(away) == pytest.approx(5.0, abs=1e-6)
 
 
+@settings(deadline=None, max_examples=8)
+@given(seed=st.integers(0, 2**31 - 1), step=st.floats(0.01, 3.0), radius=st.sampled_from([0, 0.2]))
+def test_hazards_are_never_negative_and_probabilities_never_above_one(seed, step, radius):
+    model, mover = random_map(seed, clusters=3), Mover(radius=radius, step=step)
+    starts, ends = 3 * torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(seed)).double()
+    assert (segment_hazard(model, starts, ends, mover) >= 0).all()
+    probability = free_probability(model, starts, ends, mover)
+    assert ((probability >= 0) & (probability <= 1)).all()
+    ranges = expected_range(model, starts, ends - starts, 2.0, mover)
+    assert ((ranges >= 0) & (ranges <= 2 + 1e-12)).all()
+
+
+def test_a_sphere_s_expected_range_follows_from_the_hazard_of_its_segments():
+    model, mover = ball(weight=2.0, sigma=0.5), Mover(radius=0.5, step=0.02, length=1.0)
+    start, toward = (
+        torch.tensor([-3.0, 0.0, 0.0]).double(),
+        torch.tensor([[1.0, 0.0, 0.0]]).double(),
+    )
+    depth = torch.linspace(0, 6, 201, dtype=torch.float64)[:, None]
+    ends = start + depth * toward / toward.norm()
+    hazards = segment_hazard(model, start.expand_as(ends), ends, mover)
+    assert float(hazards[-1]) > 0.5
+    expected = torch.trapezoid(torch.exp(-hazards), depth[:, 0])
+    found = expected_range(model, start, toward, 6.0, mover)
+    assert float(found) == pytest.approx(float(expected), abs=2e-3)
+
+
+def test_the_native_march_passes_over_no_hazard(monkeypatch):
+    samples = sample_rays(simulate_room(3000))
+    model = LardHilbertMap().fit(samples.points, samples.labels).requires_grad_(False)
+    starts = torch.tensor([4.4, 2.8, 1.1]).double()
+    toward = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).double()
+    found = expected_range(model, starts, toward, 6.0)
+    monkeypatch.setattr(marching, "native_ranges", lambda *_: None)
+    expected = expected_range(model, starts, toward, 6.0)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-2)
+    assert float((found - expected).abs().median()) < 1e-4
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
@@ -151,63 +190,6 @@ def test_bad_segments_are_refused(changed, message):
 def test_an_impossible_mover_is_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Mover(**settings)
-
-
-def fitted_map(seed=0):
-    """A real map, where k nearest of many clusters answer."""
-    rng = torch.Generator().manual_seed(seed)
-    points = torch.rand(3000, 3, generator=rng, dtype=torch.float64) * torch.tensor([4.0, 4.0, 2.0])
-    labels = ((points[:, 0] - 2).abs() < 0.15).double()
-    return LardHilbertMap().fit(points, labels, 120, seed=seed).requires_grad_(False)
-
-
-def test_clearance_of_a_ball_is_the_distance_to_where_it_is_clearly_occupied():
-    points = torch.tensor([[2.0, 0, 0], [0.0, -3.0, 0.0], [0.4, 0, 0]]).double()
-    expected = points.norm(dim=1) - radius_where(EVIDENCE)
-    torch.testing.assert_close(clearance(ball(), points).detach(), expected)
-
-
-def test_nothing_clearly_occupied_is_nearer_than_the_clearance():
-    model = fitted_map()
-    rng = torch.Generator().manual_seed(3)
-    points = torch.rand(300, 3, generator=rng, dtype=torch.float64) * 4
-    distance = clearance(model, points)
-    free = distance > 0
-    assert free.sum() > 50
-    around = torch.randn(300, 200, 3, generator=rng, dtype=torch.float64)
-    around = around / around.norm(dim=2, keepdim=True) * distance.clamp(min=0)[:, None, None]
-    assert (model.log_odds(points[:, None] + around)[free] <= EVIDENCE).all()
-
-
-@settings(deadline=None, max_examples=20)
-@given(seed=st.integers(0, 2**31 - 1))
-def test_clearance_changes_by_no_more_than_the_way_gone(seed):
-    rng = torch.Generator().manual_seed(seed)
-    model = random_map(seed=seed)
-    model.weights.data.abs_().add_(0.5)
-    here, there = 3 * torch.randn(2, 200, 3, generator=rng, dtype=torch.float64)
-    change = (clearance(model, here) - clearance(model, there)).abs()
-    assert (change <= (here - there).norm(dim=1) + 1e-9).all()
-
-
-def test_gradients_of_the_clearance_pass_gradcheck():
-    model = random_map(seed=2)
-    points = torch.randn(5, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: clearance(model, x), (points,))
-
-
-def test_without_occupied_clusters_the_clearance_is_infinite():
-    assert clearance(ball(weight=-1.0), torch.zeros(2, 3)).tolist() == [math.inf, math.inf]
-
-
-def test_a_threshold_that_no_evidence_separates_from_unknown_is_refused():
-    with pytest.raises(ValueError, match=r"between 0\.27 and 1; got 0\.2"):
-        clearance(ball(), torch.zeros(1, 3), threshold=0.2)
-
-
-def test_points_of_the_wrong_dimension_have_no_clearance():
-    with pytest.raises(ValueError, match=r"points must be \(\.\.\., 3\); got \(1, 2\)"):
-        clearance(ball(), torch.zeros(1, 2))
 
 
 @pytest.mark.parametrize("convert", [np.asarray, lambda a: a.tolist()])

@@ -1,6 +1,7 @@
 import math
 
 import pytest
+import small_maps
 import torch
 from test_gaussian_process import wall
 
@@ -168,6 +169,22 @@ def test_a_new_fit_forgets_the_posterior():
     model, points, labels = doubting_map()
     with pytest.raises(RuntimeError, match="call fit_uncertainty"):
         model.fit(points, labels).bayesian_probability(points)
+
+
+def test_moving_and_cropping_keep_the_variance():
+    points, labels = small_maps.wall()
+    model = small_maps.wall_map().fit_uncertainty(points, labels)
+    before = model.variance(points)
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=F64)
+    shift = torch.tensor([3.0, 4.0, 5.0], dtype=F64)
+    model.transform(turn, shift)
+    moved = points @ turn.T + shift
+    torch.testing.assert_close(model.variance(moved), before)
+    model.crop(moved.mean(dim=0), 9.0)
+    torch.testing.assert_close(model.variance(moved), before)
+    model.crop(moved[0], 0.8)
+    assert 0 < len(model) < 40
+    assert (model.posterior_variances > 0).all()
 
 
 def test_an_empty_map_has_no_uncertainty():

@@ -36,12 +36,13 @@ def sections_missing(function):
 
 def test_the_fixed_names_are_public():
     fixed = """
-        FitConfig LardHilbertMap MapViewer Mover Samples SamplingConfig ScanReport Scans StreamConfig
-        TiledMap TuneConfig UpdateConfig clearance evaluate expected_range extract_mesh fine_tune
-        free_probability frontiers grid information_gain iter_scans load_points load_scans
+        Body FitConfig LardHilbertMap MapViewer Mover Samples SamplingConfig ScanReport Scans
+        StreamConfig TiledMap TuneConfig UpdateConfig body_collision_probability body_distance
+        capsule_distance clearance collision_probability evaluate expected_range extract_mesh
+        fine_tune free_probability frontiers grid information_gain iter_scans load_points load_scans
         merge_maps query_grid query_slice raycast real_time resize_optimizer resume_stream
-        sample_rays save_grid save_mesh save_scans segment_hazard simulate_room split_rays
-        stream_scans
+        sample_rays save_grid save_mesh save_scans segment_hazard signed_distance simulate_room
+        split_rays stream_scans surface_distance
     """
     assert fixed.split() == NAMES
 

@@ -8,6 +8,10 @@ from small_maps import GaussianMap, ball, radius_where, random_map
 from lardhm_torch import LardHilbertMap, load_scans, sample_rays, split_rays
 from lardhm_torch.evaluation.held_out import protocol_rays
 from lardhm_torch.queries import raycasting
+from lardhm_torch.queries.clearance import clearance
+from lardhm_torch.queries.collision import expected_range, free_probability
+from lardhm_torch.queries.distance import signed_distance
+from lardhm_torch.queries.exploration import information_gain
 from lardhm_torch.queries.grids import EVIDENCE
 from lardhm_torch.queries.raycasting import raycast, surface_step
 
@@ -207,11 +211,16 @@ def test_bad_rays_are_refused(changed, message):
         raycast(ball(), **{**arguments, **changed})
 
 
-def test_a_map_without_occupied_clusters_needs_a_step():
-    model = ball(weight=-1.0)
-    with pytest.raises(ValueError, match="got none: give a step"):
-        raycast(model, torch.zeros(3), torch.ones(1, 3), 5.0)
-    assert raycast(model, torch.zeros(3), torch.ones(1, 3), 5.0, step=0.1) == math.inf
+@pytest.mark.parametrize("model", [LardHilbertMap(), ball(weight=-1.0)])
+def test_where_there_is_no_obstacle_rays_end_nowhere(model):
+    start, toward = torch.zeros(3), torch.ones(1, 3)
+    for surface in ("peak", "crossing"):
+        assert raycast(model, start, toward, 5.0, surface=surface) == math.inf
+    assert expected_range(model, start, toward, 5.0).tolist() == [pytest.approx(5.0)]
+    assert free_probability(model, torch.zeros(1, 3), toward).tolist() == [1.0]
+    assert clearance(model, start) == math.inf
+    assert signed_distance(model, start, 2.0) == 2.0
+    assert information_gain(model, start, toward, 5.0) > 0
 
 
 def test_an_obstacle_wider_than_the_step_is_met_wherever_it_lies():

@@ -80,6 +80,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     )
     if arguments.tune or arguments.tune_state:
         _tune(model, scans, samples, state, arguments)
+    if arguments.uncertainty:
+        model.fit_uncertainty(samples.points, samples.labels)
     model.save(arguments.output)
     hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
     print(
@@ -139,6 +141,8 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
 
     if arguments.tune or arguments.tune_state:
         raise ValueError("--tune and --tune-state need all scans at once; omit --incremental")
+    if arguments.uncertainty:
+        raise ValueError("--uncertainty needs all scans at once; omit --incremental")
     config = StreamConfig(
         num_clusters=arguments.clusters,
         radius=arguments.radius,

@@ -75,6 +75,11 @@ def _fit(sub: argparse.ArgumentParser) -> None:
         help="fine-tune centers, length scales and weights by backpropagation",
     )
     sub.add_argument(
+        "--uncertainty",
+        action="store_true",
+        help="also store the variance of the weights, for colors by variance",
+    )
+    sub.add_argument(
         "--tune-state",
         metavar="FILE",
         help="fine-tune, write a checkpoint to FILE after every epoch, and resume from it if it "
@@ -137,6 +142,11 @@ def _file_verbs(verb: Any) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
     _output(sub, "grid to write: .npz, or .bt or .ot for OctoMap")
     _resolution(sub, 0.1)
+    sub.add_argument(
+        "--distance",
+        action="store_true",
+        help="write signed distances to the nearest surface [m]; only .npz",
+    )
 
 
 def _picture_verbs(verb: Any) -> None:

@@ -55,14 +55,16 @@ def mesh(arguments: argparse.Namespace) -> None:
 
 
 def grid(arguments: argparse.Namespace) -> None:
-    """Write the probabilities of a map on a grid."""
+    """Write the probabilities of a map, or distances to its surface, on a grid."""
     from lardhm_torch.io.grid_files import GRID_SUFFIXES, save_grid
     from lardhm_torch.tiles.tiled_map import open_map
 
     check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
+    if arguments.distance and Path(arguments.output).suffix.lower() != ".npz":
+        raise ValueError(f"--output must end in .npz with --distance; got {arguments.output}")
     model = open_map(arguments.map)
     _check_resolution(model, arguments.resolution)
-    count = save_grid(model, arguments.output, arguments.resolution)
+    count = save_grid(model, arguments.output, arguments.resolution, distance=arguments.distance)
     print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.octrees import new_tree, to_array
 from lardhm_torch.maps import OccupancyMap, TensorLike
+from lardhm_torch.queries.distance import signed_distance
 from lardhm_torch.queries.grids import (
     BLOCK_POINTS,
     EVIDENCE,
@@ -33,6 +35,8 @@ def save_grid(
     path: str | os.PathLike[str],
     resolution: float = 0.1,
     bounds: tuple[TensorLike, TensorLike] | None = None,
+    *,
+    distance: bool = False,
 ) -> int:
     """Write the map as a grid of cells, in the format of the extension.
 
@@ -41,6 +45,7 @@ def save_grid(
     | extension | content |
     |---|---|
     | ``.npz`` | ``probability`` (nx, ny, nz) float32 at the centers, ``lower`` (D,), ``resolution`` |
+    | ``.npz``, with ``distance`` | ``distance`` (nx, ny, nz) float32: `signed_distance` of the centers |
     | ``.bt`` | OctoMap: occupied and free cells, the rest unknown |
     | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511), pruned |
 
@@ -53,13 +58,14 @@ def save_grid(
         path: a file that ends in .npz, .bt or .ot; an old one is replaced at the end.
         resolution: edge of a cell [m].
         bounds: lower and upper corner of the part to write, world frame [m]; None: all of it.
+        distance: write signed distances to the nearest surface instead of probabilities.
 
     Returns:
         The number of cells written.
 
     Raises:
-        ValueError: the extension is another, the map is empty or has the wrong dimension, or the
-            map lies outside what an OctoMap of this resolution spans.
+        ValueError: the extension is another (of distances: not .npz), the map is empty or has the
+            wrong dimension, or it lies outside what an OctoMap of this resolution spans.
         ImportError: an OctoMap is asked for and octomap-python is not installed.
         FileNotFoundError: the folder of path does not exist.
     """
@@ -67,27 +73,43 @@ def save_grid(
     if suffix not in GRID_SUFFIXES:
         known = ", ".join(GRID_SUFFIXES)
         raise ValueError(f"path must end in one of {known} for a grid; got {Path(path).name!r}")
+    if distance and suffix != ".npz":
+        raise ValueError(f"path must end in .npz for a grid of distances; got {Path(path).name!r}")
     lower, upper = map_bounds(model) if bounds is None else bounds
     lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in (lower, upper))
     grid_axes(lower, upper, resolution)  # raises for what is no resolution and no corners
     first, last = (lower / resolution).floor(), (upper / resolution).ceil() - 1
     first_center, last_center = ((end + 0.5) * resolution for end in (first, last.maximum(first)))
     if suffix == ".npz":
-        probability = query_grid(model, first_center, last_center, resolution)
+        ask = _distance_grid if distance else query_grid
+        values = ask(model, first_center, last_center, resolution)
+        arrays: dict[str, Any] = {
+            "distance" if distance else "probability": values.float().cpu().numpy(),
+            "lower": (first * resolution).numpy(),
+            "resolution": np.float64(resolution),
+        }
         with replaced_file(path) as partial, open(partial, "wb") as file:
-            np.savez(
-                file,
-                probability=probability.float().cpu().numpy(),
-                lower=(first * resolution).numpy(),
-                resolution=np.float64(resolution),
-            )
-        return probability.numel()
+            np.savez(file, **arrays)
+        return values.numel()
     tree, count = _octomap_of(model, first_center, last_center, resolution)
     with replaced_file(path) as partial:
         write = tree.writeBinary if suffix == ".bt" else tree.write
         if not write(os.fsencode(partial)):
             raise OSError(f"{path} cannot be written")
     return count
+
+
+@torch.no_grad()
+def _distance_grid(model: OccupancyMap, first: Tensor, last: Tensor, resolution: float) -> Tensor:
+    """Signed distances at all points of a `grid`."""
+    axes = grid_axes(first, last, resolution)
+    slabs = axes[0].split(max(1, BLOCK_POINTS // math.prod(len(axis) for axis in axes[1:])))
+    return torch.cat(
+        [
+            signed_distance(model, torch.stack(torch.meshgrid(slab, *axes[1:], indexing="ij"), -1))
+            for slab in slabs
+        ]
+    )
 
 
 def _octomap_of(

@@ -106,8 +106,8 @@ def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
     return center
 
 
-def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> MapState:
-    """The clusters within ``radius`` [m] of a position in the map frame, and those that bound them.
+def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> Tensor:
+    """(M,) mask of the clusters within ``radius`` [m] of a position in the map frame, and those that bound them.
 
     Kernels of free clusters extend beyond the sphere. Clusters outside that are not free and that such
     a kernel reaches are kept, so that walls outside the sphere do not become free space.
@@ -116,7 +116,7 @@ def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> Ma
     inside = state.rows(kept)
     outside = (~kept & (state.kinds != 1)).nonzero().squeeze(1)
     if len(inside) == 0 or len(outside) == 0:
-        return inside
+        return kept
     free = inside.rows(inside.kinds == 1)
     reached = torch.zeros_like(outside, dtype=torch.bool)
     for means in (state.means[outside], *_surroundings(state.rows(outside), kernel)):
@@ -125,7 +125,7 @@ def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> Ma
             factors = kernel_factors(free.raw_scale_tril, kernel)
             values = lard_kernel(means, free.centers, factors, indices)
             reached |= (values > REACHED).any(dim=1)
-    return state.rows(kept.index_fill(0, outside[reached], True))
+    return kept.index_fill(0, outside[reached], True)
 
 
 def _surroundings(state: MapState, kernel: Kernel) -> Iterator[Tensor]:
@@ -143,7 +143,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     their numbers of points; all other clusters are copied. Where the probability of the merged map
     deviates from that of the given maps, its weights are trained on pseudo-samples drawn from both
     maps. Maps that do not overlap are combined unchanged, and merging a map with itself does not
-    change its probabilities.
+    change its probabilities. The posterior of the weights is discarded, because the two maps were
+    calibrated apart (see `LardHilbertMap.fit_uncertainty`).
 
     Args:
         first: a `LardHilbertMap`.

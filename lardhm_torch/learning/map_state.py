@@ -80,8 +80,9 @@ def new_rows(
     if evidence is None:
         evidence = no_evidence(clusters.means)
     raw = raw_factors(factors)
-    history = (evidence, weights.clone(), weights.clone(), weights.clone())
-    return MapState(weights, clusters.means, raw, is_occupied, *clusters, *history)
+    zeros = (weights.clone() for _ in range(3))
+    moments = (clusters.counts, clusters.means, clusters.scatters)
+    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros)
 
 
 def no_evidence(means: Tensor) -> Tensor:

@@ -129,7 +129,8 @@ def raycast(
     Args:
         rays: (R, D) origins in the map's frame and (R, D) directions of length 1, float64 [m].
         march: step and largest range [m], log-odds of the threshold and of a clear obstacle, and
-            whether to go on to the ridge.
+            whether to go on to the ridge; where both log-odds are equal, the first step above
+            them is the answer.
         parameters: centers, raw factors, weights of the map.
         kernel: its settings.
         index: of the centers.
@@ -183,6 +184,30 @@ def assign(
     counts = torch.bincount(owners, minlength=len(centers))
     dtype = centers.dtype
     return labels, counts.to(dtype), sums.to(dtype), scatters.to(dtype)
+
+
+def face_tree(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Tensor:
+    """What the search knows of F faces (see `faces.Faces`); empty where it is not available."""
+    if not supports(centers):
+        return torch.empty(0, dtype=torch.uint8, device=centers.device)
+    return torch.ops.lardhm.face_tree(centers, axes, half, thickness)
+
+
+def has_tree(tree: Tensor) -> bool:
+    """Whether `nearest_face` can search with this tree."""
+    return len(tree) > 0
+
+
+def nearest_face(
+    points: Tensor, faces: Any, max_distance: float, gradient: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `distance.nearest_faces` and `distance.face_distances`, for (N, D) float64 points.
+
+    Returns:
+        (N,) signed distances [m], (N, D) gradients (or none at all), (N,) faces.
+    """
+    given = (faces.tree, faces.centers, faces.axes, faces.half, faces.thickness)
+    return torch.ops.lardhm.nearest_face(points.detach(), *given, max_distance, gradient)
 
 
 def descends(indices: Tensor, values: Tensor) -> bool:

@@ -114,6 +114,11 @@ struct Ray {
       return;
     }
     clear = next + first;
+    if (march.level == march.target) {  // the step itself is asked for
+      high = march.depth(clear);
+      phase = Phase::done;
+      return;
+    }
     if (march.ridge) return climb(march, values, first);
     next = clear;
     high = march.depth(clear);

@@ -1,20 +1,17 @@
-"""Collision probability along straight segments, expected range of rays, and clearance."""
+"""Collision probability along straight segments, and expected range of rays."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, num_neighbors, to_tensor
-from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
-from lardhm_torch.queries.hazard import HAZARD_LENGTH, survival, swept_integral
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, to_tensor
+from lardhm_torch.queries.hazard import HAZARD_LENGTH, sphere_points, swept_integral
+from lardhm_torch.queries.marching import Rays, march
 from lardhm_torch.queries.raycasting import surface_step, unit_rays
-
-CHUNK_PAIRS = 1 << 21  # pairs of a point and a cluster at a time
-MIN_THRESHOLD = 1 / (1 + math.e)  # log-odds of -1: `EVIDENCE` above it is unknown space
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +111,8 @@ def expected_range(
     """Expected range of each ray; differentiable.
 
     E[min(range, max_range)] = integral of exp(-Lambda(t)) from 0 to max_range, where Lambda(t) is
-    the integral of the hazard up to t. It is exact at the ends of the steps and taken as linear
-    within them.
+    the hazard up to t, as `segment_hazard` has it, by the trapezoidal rule. Probabilities below
+    0.0001 count as 0.
 
     Args:
         model: the map.
@@ -132,74 +129,14 @@ def expected_range(
     """
     mover = mover or Mover()
     starts, headings = unit_rays(model, origins, directions, max_range, mover.step)
-    ranges, ends = starts.new_zeros(len(starts)), starts + max_range * headings
-    mover = replace(mover, step=surface_step(model) if mover.step is None else mover.step)
-    for rows, part in local_parts(model, starts.minimum(ends), starts.maximum(ends)):
-        expected = _expected_range(part, starts[rows], headings[rows], max_range, mover)
-        ranges = ranges.index_copy(0, rows, expected)
-    return ranges
-
-
-def _expected_range(
-    model: OccupancyMap, origins: Tensor, directions: Tensor, max_range: float, mover: Mover
-) -> Tensor:
-    """(R,) expected ranges by a map held in memory [m]."""
-    count = math.ceil(max_range / (mover.step or max_range))
-    edges = torch.linspace(0, max_range, count + 1, dtype=torch.float64, device=origins.device)
-    points = origins[:, None] + edges[:, None] * directions[:, None]  # (R, count + 1, D)
-    starts, ends = (part.reshape(-1, model.dim) for part in (points[:, :-1], points[:, 1:]))
-    expected = segment_hazard(model, starts, ends, mover).reshape(-1, count)
-    # mean of exp(-Lambda) within a step, relative to its start: (1 - exp(-h)) / h
-    small = expected < 1e-4
-    divisor = torch.where(small, 1.0, expected)
-    within = torch.where(small, 1 - expected / 2, -torch.expm1(-expected) / divisor)
-    return (survival(expected) * within).sum(dim=1) * (max_range / count)
-
-
-def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -> Tensor:
-    """Lower bound on the distance to the nearest obstacle; differentiable.
-
-    An obstacle is where the log-odds exceed those of the threshold by `EVIDENCE`, as for `raycast`.
-    At most k clusters contribute there, so one of them contributes at least the k-th part. The
-    obstacle therefore lies in the ellipsoid |inv(L) (x - c)| <= E of a cluster of positive weight w,
-    with E = sqrt(2 log(k w / log-odds)). The distance to an ellipsoid is at least
-    (|inv(L) (x - c)| - E) times the smallest standard deviation, and at least |x - c| - E times the
-    largest.
-
-    Args:
-        model: the map; a tiled map must fit in memory.
-        points: (..., D) world positions [m].
-        threshold: probability of occupancy that counts as an obstacle, between 0.27 and 1.
-
-    Returns:
-        (...) float64 [m]: at most the distance to the nearest obstacle, and 1-Lipschitz. Negative
-        where an obstacle is possible; infinite if the map has no obstacle.
-
-    Raises:
-        ValueError: threshold is not between 1 / (1 + e) = 0.27 and 1, or points are not (..., D).
-    """
-    if not MIN_THRESHOLD < threshold < 1:
-        raise ValueError(f"threshold must be between 0.27 and 1; got {threshold}")
-    points = to_tensor(points, "points", model.centers.device)
-    if points.ndim == 0 or points.shape[-1] != model.dim:
-        raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
-    target = threshold_log_odds(threshold) + EVIDENCE
-    neighbors = num_neighbors(model)
-    chosen = (model.weights * neighbors > target).nonzero().squeeze(1)
-    flat = points.reshape(-1, model.dim)
-    if len(chosen) == 0:
-        return torch.full_like(flat[:, 0], torch.inf).reshape(points.shape[:-1])
-    radius = (2 * (neighbors * model.weights[chosen].double() / target).log()).sqrt()
-    factors = model.scale_tril[chosen].double()
-    centers = model.centers[chosen].double() + model.origin
-    stds = torch.linalg.svdvals(factors)
-    eye = torch.eye(model.dim, dtype=torch.float64, device=flat.device)
-    whiten = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)
-    distances = [flat.new_zeros(0)]
-    for chunk in flat.split(max(1, CHUNK_PAIRS // len(chosen))):
-        offsets = chunk[:, None] - centers
-        whitened = torch.einsum("mij,nmj->nmi", whiten, offsets)
-        by_shortest = (torch.linalg.vector_norm(whitened, dim=2) - radius) * stds[:, -1]
-        by_longest = torch.linalg.vector_norm(offsets, dim=2) - radius * stds[:, 0]
-        distances.append(torch.maximum(by_shortest, by_longest).amin(dim=1))
-    return torch.cat(distances).reshape(points.shape[:-1])
+    ends = starts + max_range * headings
+    ranges = starts.new_zeros(len(starts))
+    step = min(surface_step(model) if mover.step is None else mover.step, max_range)
+    body = sphere_points(model.dim, mover.radius).to(starts.device)
+    lower, upper = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
+    for rows, part in local_parts(model, lower.detach(), upper.detach()):
+        rays = Rays(starts[rows], headings[rows], max_range, step, mover.length, body)
+        for steps in march(part, rays):
+            gone = steps.skipped + (steps.reached * steps.widths).sum(dim=1)
+            ranges = ranges.index_add(0, rows[steps.rows], gone)
+    return ranges.clamp(max=max_range)

@@ -2,11 +2,12 @@
 
 Obstacles occur along a path like the events of a Poisson process with rate
 lambda(x) = max(log-odds(x), 0) / length [1/m]. The path is free with probability
-exp(-integral of lambda). Free and unknown space have no hazard.
+exp(-integral of lambda). Free and unknown space have no hazard. A sphere meets along its path what
+the worst of its center and points spread over its surface meets along its own.
 
 The log-odds along a line are smooth, because neighbors fade out before others replace them. Between
 the places where they change sign, which are found by bisection, a Gauss-Legendre quadrature with a
-few nodes per step integrates them.
+few nodes per step integrates them. Its weights are positive, so that no hazard is negative.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from lardhm_torch.maps import OccupancyMap, TensorLike, to_tensor
 HAZARD_LENGTH = 0.1  # [m] default path length over which log-odds of 1 are one expected obstacle
 SHORTEST = 1e-6  # [m] intervals are not bisected below this length
 NODES = 8  # of the quadrature, per interval
+NEGLIGIBLE = 1e-4  # probability to get somewhere below which nothing is expected of it
 SEGMENTS_AT_ONCE = 1 << 16
 
 
@@ -72,7 +74,7 @@ def swept_integral(
     Returns:
         (S,) integrals [m], differentiable.
     """
-    offsets = _sphere_points(model.dim, radius).to(starts.device)
+    offsets = sphere_points(model.dim, radius).to(starts.device)
     starts = (starts[:, None] + offsets).reshape(-1, model.dim)
     ends = (ends[:, None] + offsets).reshape(-1, model.dim)
     integrals = [starts.new_zeros(0)]
@@ -84,21 +86,24 @@ def swept_integral(
     return torch.cat(integrals).reshape(-1, len(offsets)).amax(dim=1)
 
 
-def survival(expected: Tensor) -> Tensor:
-    """(R, S) expected obstacles in consecutive steps -> (R, S) probability to reach each step."""
-    return torch.exp(-(expected.cumsum(dim=1) - expected))
+def reached(expected: Tensor, before: Tensor) -> Tensor:
+    """(R, S) expected obstacles in consecutive steps -> (R, S) probability to get through each.
 
+    It is the mean over the step, where the hazard is taken as constant. Probabilities below
+    `NEGLIGIBLE` become 0, and all others are stretched to [0, 1]: a march may end there.
 
-def occlusion(probability: Tensor) -> Tensor:
-    """Expected obstacles in a cell with this probability of occupancy, for a line of sight.
-
-    -log(2 (1 - p)) for p > 1/2: the fraction 2 (1 - p) of the rays passes the cell. Cells up to 1/2
-    do not occlude, so that sensors see into unknown space.
+    Args:
+        expected: (R, S) 0 or more.
+        before: (R,) expected obstacles before the first of the steps.
     """
-    return -(2 * (1 - probability)).log().clamp(max=0)
+    at_start = torch.exp(-(before[:, None] + expected.cumsum(dim=1) - expected))
+    small = expected < 1e-4
+    divisor = torch.where(small, 1.0, expected)  # (1 - exp(-h)) / h
+    within = torch.where(small, 1 - expected / 2, -torch.expm1(-expected) / divisor)
+    return ((at_start * within - NEGLIGIBLE) / (1 - NEGLIGIBLE)).clamp(min=0)
 
 
-def _sphere_points(dim: int, radius: float) -> Tensor:
+def sphere_points(dim: int, radius: float) -> Tensor:
     """(J, D) center of a sphere and points spread over its surface; the center alone for 0."""
     if radius == 0:
         return torch.zeros(1, dim, dtype=torch.float64)
@@ -151,6 +156,6 @@ def _integrate(model: OccupancyMap, starts: Tensor, ends: Tensor, intervals: Int
     path = (intervals.last - intervals.first)[:, None] * path
     nodes, shares = (torch.from_numpy(x).to(starts.device) for x in leggauss(NODES))
     points = start[:, None] + (0.5 + 0.5 * nodes[:, None]) * path[:, None]  # (I, NODES, D)
-    means = (model.log_odds(points).double() * shares).sum(dim=1) / 2
+    means = (model.log_odds(points).double().clamp(min=0) * shares).sum(dim=1) / 2
     lengths = torch.linalg.vector_norm(path, dim=1)
     return starts.new_zeros(len(starts)).index_add(0, rows, means * lengths)

@@ -74,8 +74,8 @@ def raycast(
         (R,) float64 distances [m], infinite where no obstacle lies within max_range.
 
     Raises:
-        ValueError: shapes do not match, a direction is zero or not finite, another argument is
-            outside its range, or step is None and the map has no occupied cluster.
+        ValueError: shapes do not match, a direction is zero or not finite, or another argument is
+            outside its range.
     """
     if surface not in SURFACES:
         raise ValueError(f"surface must be one of {', '.join(SURFACES)}; got {surface!r}")
@@ -237,15 +237,13 @@ def surface_step(model: OccupancyMap) -> float:
     """Default step of ray casting: median thickness of the occupied clusters [m], within 2 %.
 
     It is the middle of the median's bin in `thickness_counts`, so that a tiled map has exactly the
-    step of the merged map. It is at most about a third of the thickness of a wall.
-
-    Raises:
-        ValueError: the map has no cluster of positive weight, and so no surface.
+    step of the merged map. It is at most about a third of the thickness of a wall. Infinite if the
+    map has no cluster of positive weight, and so no surface to miss.
     """
     stored = stored_thickness_counts(model)
     counts = thickness_counts(model) if stored is None else stored
     if not counts:
-        raise ValueError("the map must hold a cluster of positive weight; got none: give a step")
+        return math.inf
     rank = (sum(counts.values()) - 1) // 2
     for number in sorted(counts):
         rank -= counts[number]

@@ -1,0 +1,534 @@
+// The nearest of many flat faces or plates, as `faces.py` defines them: a tree of boxes over them in
+// Morton order. A plate is a face with a thickness; inside of it the distance is negative.
+//
+// A node holds one register of boxes, a leaf one register of faces. The tree is searched in float32,
+// nearest child first, from a bound that the leaf of the point before gives; the distance and its
+// gradient are then computed in float64 for the one face found.
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "simd.h"
+#include "sorting.h"
+#include "tensors.h"
+
+namespace lardhm {
+namespace {
+
+constexpr int kFan = Simd<float>::W;  // children of a node, faces of a leaf
+constexpr int kMostLevels = 32;
+constexpr int64_t kPointsPerTask = 1 << 15;  // sorted together
+constexpr float kNowhere = 1e18f;  // where the padding lies; its square is finite
+constexpr uint64_t kTreeMagic = 0x3173656361666472ULL;
+
+template <int D>
+struct FaceLayout {  // floats of a face: center, axes, half edges, rounding, half thickness
+  static constexpr int center = 0, axes = D, half = D + D * D, radius = half + D - 1;
+  static constexpr int thickness = radius + 1, count = 4 * D + (D == 3 ? 4 : 1);
+};
+
+struct TreeHeader {
+  uint64_t magic;
+  int64_t bytes, faces, levels;
+  int64_t nodes[kMostLevels];  // of every level of boxes; level 0 has a box for each leaf
+  double base[3];              // [m] what the tree's positions are relative to
+  int32_t dim, fan;
+};
+
+struct TreeSections {
+  int64_t order, leaves, boxes[kMostLevels], end;
+
+  explicit TreeSections(const TreeHeader& h) {
+    int64_t at = sizeof(TreeHeader);
+    auto section = [&at](int64_t bytes) {
+      const int64_t begin = padded(at, 64);
+      at = begin + bytes;
+      return begin;
+    };
+    const int64_t count = padded(h.faces, kFan);
+    const int face = h.dim == 3 ? FaceLayout<3>::count : FaceLayout<2>::count;
+    order = section(count * 4);
+    leaves = section(count * face * 4);
+    for (int64_t level = 0; level < h.levels; ++level)
+      boxes[level] = section(h.nodes[level] * kFan * h.dim * 2 * 4);
+    end = padded(at, 64);
+  }
+};
+
+// F faces as the definition stores them, float64.
+template <int D>
+struct FaceArrays {
+  const double *centers, *axes, *half, *thickness;  // no thickness (null): faces
+
+  const double* axis(int64_t face) const { return axes + face * D * D; }
+  const double* edges(int64_t face) const { return half + face * (D - 1); }
+  double radius(int64_t face) const { return *std::min_element(edges(face), edges(face) + D - 1); }
+
+  // How far the face reaches from its center along coordinate d [m].
+  double extent(int64_t face, int d) const {
+    const double r = radius(face);
+    double sum = thickness ? std::abs(axis(face)[d * D]) * thickness[face] : 0, squares = 0;
+    for (int j = 1; j < D; ++j) {
+      const double u = axis(face)[d * D + j];
+      sum += std::abs(u) * (edges(face)[j - 1] - r);
+      squares += u * u;
+    }
+    return sum + r * std::sqrt(squares);
+  }
+};
+
+template <int D>
+TreeHeader header_of(const FaceArrays<D>& faces, int64_t count) {
+  TreeHeader h{};
+  h.magic = kTreeMagic;
+  h.faces = count;
+  h.dim = D;
+  h.fan = kFan;
+  Box<double, D> box;
+  box.add(faces.centers, 0, count, 1);
+  for (int d = 0; d < D; ++d) h.base[d] = count ? 0.5 * (box.low[d] + box.high[d]) : 0.0;
+  for (int64_t nodes = (count + kFan - 1) / kFan; nodes > 0; ) {
+    nodes = (nodes + kFan - 1) / kFan;
+    h.nodes[h.levels++] = nodes;
+    if (nodes == 1) break;
+  }
+  h.bytes = TreeSections(h).end;
+  return h;
+}
+
+template <int D>
+struct TreeBuilder {
+  const FaceArrays<D>& faces;
+  TreeHeader header;
+  Sorter sorter;
+
+  TreeBuilder(const FaceArrays<D>& faces_, int64_t count)
+      : faces(faces_), header(header_of<D>(faces_, count)) {
+    Box<double, D> box;
+    box.add(faces.centers, 0, count, 1);
+    double edges[D];
+    for (int d = 0; d < D; ++d) edges[d] = std::max(box.high[d] - box.low[d], 0.0);
+    ZCurve<D>(edges, double(4 * count + 1)).sort(faces.centers, box.low, count, sorter);
+  }
+
+  int32_t face_at(int64_t rank) const { return int32_t(uint32_t(sorter.items[rank])); }
+
+  void write(char* to) const {
+    const TreeSections at(header);
+    std::memset(to, 0, at.end);
+    std::memcpy(to, &header, sizeof(header));
+    auto* order = reinterpret_cast<int32_t*>(to + at.order);
+    auto* leaves = reinterpret_cast<float*>(to + at.leaves);
+    const int64_t count = padded(header.faces, kFan);
+    for (int64_t rank = 0; rank < count; ++rank) {
+      const bool real = rank < header.faces;
+      order[rank] = real ? face_at(rank) : -1;
+      if (real) write_face(face_at(rank), leaves + rank * FaceLayout<D>::count);
+    }
+    for (int64_t level = 0; level < header.levels; ++level)
+      write_boxes(level, to, at);
+  }
+
+ private:
+  void write_face(int64_t face, float* to) const {
+    using L = FaceLayout<D>;
+    for (int d = 0; d < D; ++d)
+      to[L::center + d] = float(faces.centers[face * D + d] - header.base[d]);
+    for (int i = 0; i < D * D; ++i) to[L::axes + i] = float(faces.axis(face)[i]);
+    for (int j = 0; j < D - 1; ++j) to[L::half + j] = float(faces.edges(face)[j]);
+    to[L::radius] = float(faces.radius(face));
+    to[L::thickness] = faces.thickness ? float(faces.thickness[face]) : 0;
+  }
+
+  // Boxes of the leaves (level 0) or of the nodes one level below.
+  void write_boxes(int64_t level, char* to, const TreeSections& at) const {
+    auto* boxes = reinterpret_cast<float*>(to + at.boxes[level]);
+    const auto* below = level ? reinterpret_cast<const float*>(to + at.boxes[level - 1]) : nullptr;
+    const int64_t children =
+        level ? header.nodes[level - 1] : (header.faces + kFan - 1) / kFan;
+    for (int64_t i = 0; i < header.nodes[level] * kFan; ++i)
+      for (int d = 0; d < D; ++d) {
+        float low = kNowhere, high = kNowhere;
+        if (i < children) level ? join(below, i, d, low, high) : cover(i, d, low, high);
+        float* node = boxes + i / kFan * kFan * D * 2 + i % kFan;
+        node[d * kFan] = low;
+        node[(D + d) * kFan] = high;
+      }
+  }
+
+  void cover(int64_t leaf, int d, float& low, float& high) const {
+    double from = std::numeric_limits<double>::infinity(), to = -from;
+    const int64_t stop = std::min(header.faces, (leaf + 1) * kFan);
+    for (int64_t rank = leaf * kFan; rank < stop; ++rank) {
+      const int64_t face = face_at(rank);
+      const double middle = faces.centers[face * D + d] - header.base[d];
+      const double extent = faces.extent(face, d) * (1 + 1e-6);
+      from = std::min(from, middle - extent);
+      to = std::max(to, middle + extent);
+    }
+    low = float(from), high = float(to);
+  }
+
+  static void join(const float* below, int64_t node, int d, float& low, float& high) {
+    const float* boxes = below + node * kFan * D * 2;
+    low = boxes[d * kFan], high = boxes[(D + d) * kFan];
+    for (int lane = 1; lane < kFan; ++lane) {
+      if (boxes[d * kFan + lane] == kNowhere) continue;  // padding follows what is real
+      low = std::min(low, boxes[d * kFan + lane]);
+      high = std::max(high, boxes[(D + d) * kFan + lane]);
+    }
+  }
+};
+
+template <int D>
+struct Tree {
+  using V = Simd<float>::V;
+  using I = Simd<float>::I;
+  TreeHeader header;
+  const int32_t* order;
+  const float *leaves, *boxes[kMostLevels];
+
+  explicit Tree(const char* bytes) {
+    std::memcpy(&header, bytes, sizeof(header));
+    const TreeSections at(header);
+    order = reinterpret_cast<const int32_t*>(bytes + at.order);
+    leaves = reinterpret_cast<const float*>(bytes + at.leaves);
+    for (int64_t level = 0; level < header.levels; ++level)
+      boxes[level] = reinterpret_cast<const float*>(bytes + at.boxes[level]);
+  }
+};
+
+inline Simd<float>::V absolute(Simd<float>::V x) {
+  return (Simd<float>::V)((Simd<float>::I)x & 0x7fffffff);
+}
+
+inline Simd<float>::V positive(Simd<float>::V x) {
+  return x > 0 ? x : Simd<float>::V{};
+}
+
+inline Simd<float>::V root(Simd<float>::V x) {
+#if defined(LARDHM_AVX512)
+  return (Simd<float>::V)_mm512_sqrt_ps((__m512)x);
+#elif defined(__AVX2__)
+  return (Simd<float>::V)_mm256_sqrt_ps((__m256)x);
+#else
+  for (int lane = 0; lane < kFan; ++lane) x[lane] = std::sqrt(x[lane]);
+  return x;
+#endif
+}
+
+// A register of neighboring points on their way through the tree, one a lane.
+template <int D, bool Solid>
+struct Packet {
+  using V = Simd<float>::V;
+  using I = Simd<float>::I;
+  const Tree<D>& tree;
+  V x[D];
+  V best;   // [m^2] squared distance of the nearest face so far; negative inside of a plate
+  I found;  // its rank
+  float low[D], high[D];
+
+  explicit Packet(const Tree<D>& tree_) : tree(tree_) {}
+
+  void start(float bound) {
+    best = V{} + bound;
+    found = I{} - 1;
+    for (int d = 0; d < D; ++d) {
+      low[d] = smallest_lane<float>(x[d]);
+      high[d] = -smallest_lane<float>(-x[d]);
+    }
+  }
+
+  void look_at(int64_t rank) {
+    using L = FaceLayout<D>;
+    const float* at = tree.leaves + rank * L::count;
+    V offset[D], edge[D], lower{};
+    for (int d = 0; d < D; ++d) offset[d] = x[d] - at[L::center + d];
+    for (int j = 0; j < D; ++j) {
+      V u = offset[0] * at[L::axes + j];
+      for (int d = 1; d < D; ++d) u += offset[d] * at[L::axes + d * D + j];
+      edge[j] = u;
+      if (j) edge[j] = absolute(u) - at[L::half + j - 1];
+      if (Solid && !j) edge[j] = absolute(u) - at[L::thickness];
+      const V outside = j || Solid ? positive(edge[j]) : edge[j];
+      lower += outside * outside;
+    }
+    if (!bits_of<float>(or_inside(lower) < best)) return;
+    V squares{};
+    for (int j = 1; j < D; ++j) {
+      const V beyond = positive(edge[j] + at[L::radius]);
+      squares += beyond * beyond;
+    }
+    const V side = root(squares) - at[L::radius], beside = positive(side);
+    V distance = edge[0] * edge[0] + beside * beside;
+    if (Solid) {
+      const V above = positive(edge[0]), inside = edge[0] > side ? edge[0] : side;
+      distance = inside > 0 ? above * above + beside * beside : -(inside * inside);
+    }
+    found = distance < best ? I{} + int32_t(rank) : found;
+    best = distance < best ? distance : best;
+  }
+
+  // Bounds of squared distances: inside of a box there may be the inside of a plate.
+  static V or_inside(V squared) {
+    return Solid ? (squared > 0 ? squared : V{} - std::numeric_limits<float>::max()) : squared;
+  }
+
+  void visit(int64_t level, int64_t node) {
+    const float* at = tree.boxes[level] + node * kFan * D * 2;
+    V near{};  // of the packet's box, a child a lane
+    for (int d = 0; d < D; ++d) {
+      const V below = load<V>(at + d * kFan) - high[d], above = low[d] - load<V>(at + (D + d) * kFan);
+      const V outside = positive(below > above ? below : above);
+      near += outside * outside;
+    }
+    near = or_inside(near);
+    for (;;) {
+      const float least = smallest_lane<float>(near), worst = -smallest_lane<float>(-best);
+      if (!(least < worst)) return;
+      const int lane = __builtin_ctz(bits_of<float>(near == least));
+      near[lane] = std::numeric_limits<float>::infinity();
+      if (!reaches(at + lane)) continue;
+      const int64_t child = node * kFan + lane;
+      if (level) {
+        visit(level - 1, child);
+        continue;
+      }
+      const int64_t stop = std::min(tree.header.faces, (child + 1) * kFan);
+      for (int64_t rank = child * kFan; rank < stop; ++rank) look_at(rank);
+    }
+  }
+
+ private:
+  // Whether a child's box is nearer to some point than what it has found.
+  bool reaches(const float* at) const {
+    V near{};
+    for (int d = 0; d < D; ++d) {
+      const V below = at[d * kFan] - x[d], above = x[d] - at[(D + d) * kFan];
+      const V outside = positive(below > above ? below : above);
+      near += outside * outside;
+    }
+    return bits_of<float>(or_inside(near) < best) != 0;
+  }
+};
+
+// Signed distance to one face or plate, float64, and its gradient where asked.
+template <int D>
+double exact(const FaceArrays<D>& faces, int64_t face, const double* point, double* gradient) {
+  const double* axes = faces.axis(face);
+  const double radius = faces.radius(face);
+  double u[D] = {}, beyond[D] = {}, slope[D] = {}, squares = 0;
+  for (int d = 0; d < D; ++d) {
+    const double offset = point[d] - faces.centers[face * D + d];
+    for (int j = 0; j < D; ++j) u[j] += offset * axes[d * D + j];
+  }
+  for (int j = 1; j < D; ++j) {
+    beyond[j] = std::max(std::abs(u[j]) - (faces.edges(face)[j - 1] - radius), 0.0);
+    squares += beyond[j] * beyond[j];
+  }
+  const double length = std::sqrt(squares), side = length - radius;
+  double height = u[0], up = 1, value;
+  if (faces.thickness) {
+    height = std::abs(u[0]) - faces.thickness[face];
+    up = std::copysign(1.0, u[0]);
+  }
+  double part[2];  // of the height and of what is beside in the gradient
+  if (faces.thickness && std::max(height, side) <= 0) {
+    value = std::max(height, side);
+    part[0] = height >= side, part[1] = height < side;
+  } else if (side > 0 && !(faces.thickness && height <= 0)) {
+    const double sign = !faces.thickness && -height > side ? -1.0 : 1.0;
+    const double distance = std::sqrt(height * height + side * side);
+    value = sign * distance;
+    part[0] = sign * height / distance, part[1] = sign * side / distance;
+  } else {
+    value = side > 0 ? side : height;
+    part[0] = side <= 0, part[1] = side > 0;
+  }
+  if (gradient) {
+    slope[0] = part[0] * up;
+    for (int j = 1; j < D; ++j)
+      slope[j] = length > 0 ? part[1] * std::copysign(beyond[j] / length, u[j]) : 0.0;
+    for (int d = 0; d < D; ++d) {
+      gradient[d] = 0;
+      for (int j = 0; j < D; ++j) gradient[d] += axes[d * D + j] * slope[j];
+    }
+  }
+  return value;
+}
+
+// Answers for some points, in the order of a Z curve: a packet begins with the face of the one before.
+template <int D>
+struct Answer {
+  const double* points;
+  const Tree<D>& tree;
+  const FaceArrays<D>& faces;
+  double max_distance;
+  double *values, *gradients;  // no gradients: null
+  int64_t* nearest;
+
+  void run(int64_t begin, int64_t end) const {
+    faces.thickness ? search<true>(begin, end) : search<false>(begin, end);
+  }
+
+ private:
+  template <bool Solid>
+  void search(int64_t begin, int64_t end) const {
+    const std::vector<int64_t> rows = sorted_rows(begin, end);
+    Packet<D, Solid> packet(tree);
+    int64_t last = 0;
+    for (int64_t i = 0; i < int64_t(rows.size()); i += kFan) {
+      const int lanes = int(std::min<int64_t>(kFan, int64_t(rows.size()) - i));
+      float x[D][kFan];
+      for (int lane = 0; lane < kFan; ++lane) {
+        const double* point = points + rows[i + std::min(lane, lanes - 1)] * D;
+        for (int d = 0; d < D; ++d) x[d][lane] = float(point[d] - tree.header.base[d]);
+      }
+      for (int d = 0; d < D; ++d) packet.x[d] = load<Simd<float>::V>(x[d]);
+      packet.start(float(max_distance * max_distance * (1 + 1e-6)));
+      if (tree.header.faces) {
+        packet.look_at(last);
+        packet.visit(tree.header.levels - 1, 0);
+      }
+      int32_t found[kFan];
+      std::memcpy(found, &packet.found, sizeof(found));
+      for (int lane = 0; lane < lanes; ++lane) finish(rows[i + lane], found[lane]);
+      last = std::max(0, int(found[lanes - 1]));
+    }
+  }
+
+  // The finite points along a Z curve; the others are answered at once.
+  std::vector<int64_t> sorted_rows(int64_t begin, int64_t end) const {
+    Box<double, D> box;
+    box.add(points, begin, end, 1);
+    double edges[D];
+    for (int d = 0; d < D; ++d) {
+      if (!(box.low[d] <= box.high[d])) box.low[d] = box.high[d] = 0;
+      edges[d] = box.high[d] - box.low[d];
+    }
+    Sorter sorter;
+    ZCurve<D>(edges, double(end - begin)).sort(points + begin * D, box.low, end - begin, sorter);
+    std::vector<int64_t> rows;
+    rows.reserve(end - begin);
+    for (uint64_t item : sorter.items) {
+      const int64_t row = begin + int64_t(uint32_t(item));
+      if (is_finite(points + row * D, D))
+        rows.push_back(row);
+      else
+        set(row, std::numeric_limits<double>::quiet_NaN(), -1);
+    }
+    return rows;
+  }
+
+  void set(int64_t row, double value, int64_t face) const {
+    values[row] = value;
+    nearest[row] = face;
+    if (gradients && face < 0) std::fill_n(gradients + row * D, D, 0.0);
+  }
+
+  void finish(int64_t row, int64_t rank) const {
+    if (rank < 0) return set(row, max_distance, -1);
+    const int64_t face = tree.order[rank];
+    const double value =
+        exact<D>(faces, face, points + row * D, gradients ? gradients + row * D : nullptr);
+    const bool is_near = (faces.thickness ? value : std::abs(value)) < max_distance;
+    set(row, is_near ? value : max_distance, is_near ? face : -1);
+  }
+};
+
+void check_faces(const Tensor& centers, const Tensor& axes, const Tensor& half,
+                 const Tensor& thickness) {
+  const int64_t count = centers.size(0), dim = centers.size(1);
+  check(centers.dim() == 2 && (dim == 2 || dim == 3), "centers must be (F, 2) or (F, 3)");
+  check(axes.dim() == 3 && axes.size(0) == count && axes.size(1) == dim && axes.size(2) == dim,
+        "axes must be (F, D, D)");
+  check(half.dim() == 2 && half.size(0) == count && half.size(1) == dim - 1,
+        "half must be (F, D - 1)");
+  check(thickness.dim() == 1 && (thickness.size(0) == 0 || thickness.size(0) == count),
+        "thickness must be (F,), or (0,) for faces");
+  for (const Tensor* t : {&centers, &axes, &half, &thickness})
+    check(t->scalar_type() == ScalarType::Double, "faces must be float64");
+  check(count < (int64_t(1) << 30), "faces must be fewer than 2^30");
+}
+
+template <int D>
+FaceArrays<D> arrays_of(const Tensor& centers, const Tensor& axes, const Tensor& half,
+                        const Tensor& thickness) {
+  return {in<double>(centers), in<double>(axes), in<double>(half),
+          thickness.size(0) ? in<double>(thickness) : nullptr};
+}
+
+template <class Use>
+auto by_dimension(int64_t dim, const Use& use) {
+  return dim == 2 ? use(std::integral_constant<int, 2>{}) : use(std::integral_constant<int, 3>{});
+}
+
+Tensor face_tree(const Tensor& given_centers, const Tensor& given_axes, const Tensor& given_half,
+                 const Tensor& given_thickness) {
+  const Tensor centers = tidy(given_centers), axes = tidy(given_axes), half = tidy(given_half);
+  const Tensor thickness = tidy(given_thickness);
+  check_faces(centers, axes, half, thickness);
+  return by_dimension(centers.size(1), [&](auto dim) {
+    const auto faces = arrays_of<dim()>(centers, axes, half, thickness);
+    const TreeBuilder<dim()> builder(faces, centers.size(0));
+    const Tensor bytes =
+        torch::stable::new_empty(centers, {builder.header.bytes}, ScalarType::Byte);
+    builder.write(out<char>(bytes));
+    return bytes;
+  });
+}
+
+std::tuple<Tensor, Tensor, Tensor> nearest_face(
+    const Tensor& given_points, const Tensor& given_tree, const Tensor& given_centers,
+    const Tensor& given_axes, const Tensor& given_half, const Tensor& given_thickness,
+    double max_distance, bool gradient) {
+  const Tensor points = tidy(given_points), tree = tidy(given_tree);
+  const Tensor centers = tidy(given_centers), axes = tidy(given_axes), half = tidy(given_half);
+  const Tensor thickness = tidy(given_thickness);
+  check_faces(centers, axes, half, thickness);
+  check_rows("points", points, centers);
+  const int64_t n = points.size(0), dim = points.size(1);
+  TreeHeader header{};
+  check(tree.scalar_type() == ScalarType::Byte && tree.numel() >= int64_t(sizeof(header)),
+        "tree must be made by face_tree");
+  std::memcpy(&header, tree.const_data_ptr(), sizeof(header));
+  check(header.magic == kTreeMagic && header.bytes == tree.numel() && header.dim == dim &&
+            header.fan == kFan && header.faces == centers.size(0),
+        "tree must be made by face_tree of these faces");
+  check(max_distance >= 0, "max_distance must be 0 or more");
+  const Tensor values = torch::stable::new_empty(points, {n});
+  const Tensor slopes = torch::stable::new_empty(points, {gradient ? n : 0, dim});
+  const Tensor nearest = torch::stable::new_empty(points, {n}, ScalarType::Long);
+  by_dimension(dim, [&](auto d) {
+    const auto faces = arrays_of<d()>(centers, axes, half, thickness);
+    const Tree<d()> search(in<char>(tree));
+    const Answer<d()> answer{in<double>(points), search, faces, max_distance, out<double>(values),
+                             gradient ? out<double>(slopes) : nullptr, out<int64_t>(nearest)};
+    const int64_t share = (n + num_threads() - 1) / num_threads();
+    const int64_t size = std::clamp<int64_t>(share, 1, kPointsPerTask);
+    run_tasks((n + size - 1) / size,
+              [&](int64_t task) { answer.run(task * size, std::min(n, (task + 1) * size)); });
+    return 0;
+  });
+  return {values, slopes, nearest};
+}
+
+}  // namespace
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def("face_tree(Tensor centers, Tensor axes, Tensor half, Tensor thickness) -> Tensor");
+  m.def(
+      "nearest_face(Tensor points, Tensor tree, Tensor centers, Tensor axes, Tensor half, "
+      "Tensor thickness, float max_distance, bool gradient) -> (Tensor, Tensor, Tensor)");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
+  m.impl("face_tree", TORCH_BOX(&lardhm::face_tree));
+  m.impl("nearest_face", TORCH_BOX(&lardhm::nearest_face));
+}

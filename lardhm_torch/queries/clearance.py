@@ -1,0 +1,131 @@
+"""Lower bound on the distance to the nearest obstacle, with gradient."""
+
+from __future__ import annotations
+
+import weakref
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lardhm_torch.maps import OccupancyMap, TensorLike, num_neighbors, to_tensor
+from lardhm_torch.queries.distance import height_and_side, nearest_faces, to_nearest
+from lardhm_torch.queries.faces import Faces, plates_of, surface_faces
+from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
+
+MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
+LATTICE = 7  # points along each axis of a cluster at which the map is asked
+NEARLY = 0.5  # log-odds below those of an obstacle by no more count as one: it may lie in between
+CHUNK_POINTS = 1 << 17
+
+
+def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -> Tensor:
+    """Lower bound on the distance to the nearest obstacle; differentiable.
+
+    An obstacle is where the log-odds exceed those of the threshold by `EVIDENCE`, as for `raycast`.
+    The result is the larger one of two lower bounds.
+
+    - At most k clusters contribute to an obstacle, so one of them contributes at least the k-th
+      part: it lies in the ellipsoid |inv(L) (x - c)| <= E of a cluster of positive weight w, with
+      E = sqrt(2 log(k w / log-odds)). The bound is the distance to plates around the ellipsoids.
+    - On a lattice over all these ellipsoids, the map tells where it has obstacles, or nearly has.
+      The bound is the distance to the `faces` of the map, made so thick that they contain them. It
+      is much tighter, but an obstacle smaller than the lattice, between two of its points, is not
+      seen.
+
+    Args:
+        model: the map; a tiled map must fit in memory.
+        points: (..., D) world positions [m].
+        threshold: probability of occupancy that counts as an obstacle, between 0.27 and 1.
+
+    Returns:
+        (...) float64 [m]: at most the distance to the nearest obstacle, and 1-Lipschitz. Negative
+        where an obstacle is possible; infinite if the map has no obstacle.
+
+    Raises:
+        ValueError: threshold is not between 1 / (1 + e) = 0.27 and 1, or points are not (..., D).
+    """
+    if not MIN_THRESHOLD < threshold < 1:
+        raise ValueError(f"threshold must be between 0.27 and 1; got {threshold}")
+    points = to_tensor(points, "points", model.origin.device)
+    if points.ndim == 0 or points.shape[-1] != model.dim:
+        raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
+    local = points.reshape(-1, model.dim) - model.origin
+    plates = obstacle_plates(model, threshold_log_odds(threshold) + EVIDENCE)
+    bounds = [to_nearest(local, part, torch.inf) for part in plates]
+    return torch.maximum(*bounds).reshape(points.shape[:-1])
+
+
+class _Obstacles(NamedTuple):
+    """Two sets of plates; each of them contains all obstacles of a map."""
+
+    ellipsoids: Faces
+    surfaces: Faces
+
+
+_kept: weakref.WeakKeyDictionary[OccupancyMap, tuple[tuple[Tensor, ...], _Obstacles]]
+_kept = weakref.WeakKeyDictionary()
+
+
+@torch.no_grad()
+def obstacle_plates(model: OccupancyMap, target: float) -> _Obstacles:
+    """Plates around every point whose log-odds exceed a target above 0; kept with the map."""
+    parts = (model.origin, model.weights, model.centers, model.scale_tril)
+    source = tuple(part.detach() for part in parts)
+    source = (*source, model.origin.new_tensor(target))
+    before, plates = _kept.get(model, ((), None))
+    if plates is not None and all(map(torch.equal, source, before)):
+        return plates
+    ellipsoids = _ellipsoids(model, target)
+    plates = _Obstacles(ellipsoids, _around_surfaces(model, ellipsoids, target))
+    _kept[model] = tuple(part.clone() for part in source), plates
+    return plates
+
+
+def _ellipsoids(model: OccupancyMap, target: float) -> Faces:
+    """Plates around the ellipsoids of all clusters that can contribute enough to an obstacle."""
+    weights = model.weights.detach().double()
+    most = min(num_neighbors(model), int((weights > 0).sum()))
+    rows = (weights * most > target).nonzero().squeeze(1)
+    axes, stds, _ = torch.linalg.svd(model.scale_tril.detach()[rows].double())
+    axes, stds = axes.flip(2).contiguous(), stds.flip(1)  # the thinnest axis first
+    extents = stds * (2 * (most * weights[rows] / target).log()).sqrt()[:, None]
+    centers = model.centers.detach()[rows].double()
+    return plates_of(centers, axes, extents[:, 1:].contiguous(), extents[:, 0].contiguous())
+
+
+def _around_surfaces(model: OccupancyMap, ellipsoids: Faces, target: float) -> Faces:
+    """The faces of the map, made so thick that they contain what exceeds the target nearby.
+
+    The map is asked on a lattice over each ellipsoid. One that holds obstacles far from all faces is
+    added as it is.
+    """
+    faces = surface_faces(model)
+    if len(faces.centers) == 0:
+        return ellipsoids
+    steps = torch.linspace(-1, 1, LATTICE, dtype=torch.float64, device=faces.half.device)
+    lattice = torch.cartesian_prod(*[steps] * model.dim).reshape(-1, model.dim)
+    extents = torch.cat([ellipsoids.thickness[:, None], ellipsoids.half], dim=1)
+    ends = faces.centers.new_zeros(3, len(faces.centers))  # before, behind and beside each face
+    lonely = torch.zeros(len(extents), dtype=torch.bool, device=extents.device)
+    rows = torch.arange(len(extents), device=extents.device)
+    for some in rows.split(max(1, CHUNK_POINTS // len(lattice))):
+        axes = ellipsoids.axes[some] * extents[some, None]
+        points = ellipsoids.centers[some, None] + torch.einsum("mde,se->msd", axes, lattice)
+        slack = extents[some, 0] / (LATTICE - 1)
+        is_near = model.log_odds(points + model.origin) > target - NEARLY
+        owner = is_near.nonzero()[:, 0]
+        points = points[is_near]
+        nearest = nearest_faces(points, faces, torch.inf)
+        height, side = height_and_side(points, faces, nearest)
+        is_far = torch.hypot(height, side.clamp(min=0)) > extents[some].amax(dim=1)[owner]
+        lonely[some[owner[is_far]]] = True
+        kept = ~lonely[some[owner]]
+        for end, away in zip(ends, (height, -height, side), strict=True):
+            end.scatter_reduce_(0, nearest[kept], (away + slack[owner])[kept], "amax")
+    before, behind, beside = ends
+    centers = faces.centers + ((before - behind) / 2)[:, None] * faces.axes[:, :, 0]
+    plates = (centers, faces.axes, faces.half + beside[:, None], (before + behind) / 2)
+    others = (ellipsoids.centers, ellipsoids.axes, ellipsoids.half, ellipsoids.thickness)
+    parts = zip(plates, others, strict=True)
+    return plates_of(*(torch.cat([ours, theirs[lonely]]) for ours, theirs in parts))

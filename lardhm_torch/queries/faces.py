@@ -1,0 +1,214 @@
+"""The surface of a map as flat faces: one for each side of an occupied cluster.
+
+The hits of a cluster lie in a plate: its plane goes through their mean, across their direction of
+least variance. A plate has a face on each side from which it was seen, one standard deviation of the
+hits in front of their mean: nearest hits are that far in front of the mean of noisy hits. Its edges
+are those of hits spread evenly. It ends earlier where the log-odds fall, and counts only if the map
+holds its center to be occupied.
+
+The faces of a map are kept. After an update only those near changed clusters are made again.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+from lardhm_torch.maps import OccupancyMap, covariance_scale, num_neighbors
+from lardhm_torch.queries.grids import EVIDENCE
+
+EDGE = math.sqrt(3)  # half edge of a uniform distribution, in standard deviations
+FADES = 0.4  # of the log-odds at the center: a plate ends where they are below this
+STEPS = 4  # from the center to an edge at which the log-odds are compared
+SIDES = (0.15, 0.3)  # [m] in front of a face, where a sensor that saw it left free space
+CHUNK_CLUSTERS = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """F rectangles with rounded corners; the rounding's radius is the shortest half edge.
+
+    Attributes:
+        centers: (F, D) float64, map frame [m].
+        axes: (F, D, D) float64 orthonormal columns: the normal, into free space, then the edges.
+        half: (F, D - 1) float64 half edges [m].
+        thickness: (F,) float64 half thickness of plates [m]; (0,) for faces, which have a front.
+        noise: (F,) float64 standard deviation of the hits across a face [m]; (0,) for plates.
+        tree: of the native search; empty where it is not available.
+    """
+
+    centers: Tensor
+    axes: Tensor
+    half: Tensor
+    thickness: Tensor
+    noise: Tensor
+    tree: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Plates:
+    """Plates of the M clusters of a map, and the tensors that they were made from.
+
+    ``is_surface`` (M,); ``is_seen`` (M, 2) from the side of the normal and from the other;
+    ``centers`` (M, D), ``axes`` (M, D, D) and ``half`` (M, D), the thickness first.
+    """
+
+    source: tuple[Tensor, ...]
+    is_surface: Tensor
+    is_seen: Tensor
+    centers: Tensor
+    axes: Tensor
+    half: Tensor
+
+
+_kept: weakref.WeakKeyDictionary[OccupancyMap, tuple[_Plates, Faces]] = weakref.WeakKeyDictionary()
+
+
+@torch.no_grad()
+def surface_faces(model: OccupancyMap) -> Faces:
+    """The faces of a map held in memory, from the last call where no cluster has changed since."""
+    source = _source(model)
+    plates, faces = _kept.get(model, (None, None))
+    if plates is not None and faces is not None:
+        before = plates.source
+        if all(map(torch.equal, source, before)):
+            return faces
+    plates = _updated(model, source, plates)
+    faces = _faces_of(plates)
+    _kept[model] = plates, faces
+    return faces
+
+
+def _source(model: OccupancyMap) -> tuple[Tensor, ...]:
+    """Everything that the plates are made from: origin, weights, kernels, and the hits' moments."""
+    raw = getattr(model, "raw_scale_tril", None)
+    kernels = model.scale_tril if raw is None else raw
+    return (model.origin, model.weights.detach(), model.centers.detach(), kernels.detach(),
+            *_moments(model))  # fmt: skip
+
+
+def _moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor]:
+    """(M,) whether a cluster is one of hits, their (M, D) means and (M, D, D) covariances."""
+    if hasattr(model, "scatters"):
+        counts = model.counts.clamp(min=1).to(model.means.dtype)  # type: ignore[attr-defined]
+        return (
+            model.is_occupied & (model.counts > 0),  # type: ignore[attr-defined]
+            model.means,  # type: ignore[attr-defined]
+            model.scatters / counts[:, None, None],  # type: ignore[attr-defined]
+        )
+    factors = model.scale_tril.detach()
+    return (
+        model.weights.detach() > 0,
+        model.centers.detach(),
+        factors @ factors.mT / covariance_scale(model),
+    )
+
+
+def _updated(model: OccupancyMap, source: tuple[Tensor, ...], old: _Plates | None) -> _Plates:
+    """Plates of the map: the old ones, and new ones where a cluster near them has changed."""
+    origin, weights, centers, _, is_hit, means, _ = source
+    dim, count = model.dim, len(weights)
+    new = _Plates(
+        tuple(tensor.clone() for tensor in source),
+        torch.zeros_like(is_hit),
+        torch.zeros(count, 2, dtype=torch.bool, device=origin.device),
+        torch.zeros(count, dim, dtype=torch.float64, device=origin.device),
+        torch.zeros(count, dim, dim, dtype=torch.float64, device=origin.device),
+        torch.zeros(count, dim, dtype=torch.float64, device=origin.device),
+    )
+    rows = is_hit.nonzero().squeeze(1)
+    if old is not None and torch.equal(old.source[0], origin) and len(old.source[1]) <= count:
+        kept = len(old.source[1])
+        for name in ("is_surface", "is_seen", "centers", "axes", "half"):
+            getattr(new, name)[:kept] = getattr(old, name)
+        changed = torch.ones(count, dtype=torch.bool, device=origin.device)
+        changed[:kept] = False
+        for ours, theirs in zip(source[1:], old.source[1:], strict=True):
+            changed[:kept] |= (ours[:kept] != theirs).reshape(kept, -1).any(dim=1)
+        new.is_surface[changed] = False
+        places = torch.cat([centers[changed], old.source[2][changed[:kept]]])
+        rows = rows[changed[rows] | _near(model, means[rows], places)]
+    for some in rows.split(CHUNK_CLUSTERS):
+        _make_plates(model, some, new)
+    return new
+
+
+def _near(model: OccupancyMap, means: Tensor, places: Tensor) -> Tensor:
+    """(M,) whether a cluster at one of these places may answer where a plate asks the map."""
+    if len(places) == 0 or len(means) == 0:
+        return torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    centers = model.centers.detach()
+    farthest = native.nearest_centers(means, centers, num_neighbors(model))
+    reach = torch.linalg.vector_norm(centers[farthest] - means[:, None], dim=2).amax(dim=1)
+    closest = places[native.nearest_centers(means, places, 1).squeeze(1)]
+    return torch.linalg.vector_norm(closest - means, dim=1) <= reach + 4 * max(SIDES)
+
+
+def _make_plates(model: OccupancyMap, rows: Tensor, plates: _Plates) -> None:
+    """Write the plates of some clusters of hits."""
+    *_, means, covariances = plates.source
+    centers, dim = means[rows].double(), model.dim
+    values, axes = torch.linalg.eigh(covariances[rows].double())
+    half = values.clamp(min=0).sqrt()
+    half[:, 1:] *= EDGE
+
+    def log_odds(offsets: Tensor) -> Tensor:
+        """(B, S, D) offsets from the centers -> (B, S) log-odds."""
+        points = (centers[:, None] + offsets) + plates.source[0]
+        return model.log_odds(points.reshape(-1, dim)).reshape(offsets.shape[:2]).double()
+
+    inside = log_odds(torch.zeros_like(centers)[:, None]).squeeze(1)
+    ahead = half.new_tensor(SIDES) + half[:, :1]  # (B, S)
+    normals = ahead[:, :, None] * axes[:, None, :, 0]
+    seen = [log_odds(side * normals).amin(dim=1) < -EVIDENCE for side in (1, -1)]
+    limit = (FADES * inside)[:, None]
+    steps = torch.arange(1, STEPS + 1, device=rows.device) / STEPS
+    ends = [torch.zeros_like(centers) for _ in range(2)]
+    for axis in range(1, dim):
+        edge = half[:, axis, None] * axes[:, :, axis]
+        for end, side in zip(ends, (1, -1), strict=True):
+            along = log_odds(side * steps[:, None].double() * edge[:, None])
+            end[:, axis] = _until(torch.cat([inside[:, None], along], dim=1), limit)
+    half[:, 1:] *= (ends[0] + ends[1])[:, 1:] / 2
+    shift = torch.einsum("mde,me->md", axes[:, :, 1:], (ends[0] - ends[1])[:, 1:] / 2 * EDGE
+                         * values.clamp(min=0).sqrt()[:, 1:])  # fmt: skip
+    plates.is_surface[rows] = inside > 0
+    plates.is_seen[rows] = torch.stack(seen, dim=1)
+    plates.centers[rows], plates.axes[rows], plates.half[rows] = centers + shift, axes, half
+
+
+def _until(values: Tensor, limit: Tensor) -> Tensor:
+    """(B, S) values at equal steps from 0 to 1, above (B, 1) limits at 0 -> (B,) where they cross."""
+    below = values < limit
+    first = below.to(torch.uint8).argmax(dim=1, keepdim=True).clamp(min=1)
+    before, after = values.gather(1, first - 1), values.gather(1, first)
+    part = ((before - limit) / (before - after).clamp(min=1e-12)).clamp(0, 1)
+    where = (first - 1 + part).squeeze(1) / (values.shape[1] - 1)
+    return torch.where(below.any(dim=1), where, 1.0)
+
+
+def _faces_of(plates: _Plates) -> Faces:
+    """One face on each side that was seen; on both where none was."""
+    parts = []
+    for side, seen in ((1, plates.is_seen[:, 0]), (-1, plates.is_seen[:, 1])):
+        wanted = plates.is_surface & (seen | ~plates.is_seen.any(dim=1))
+        rows = wanted.nonzero().squeeze(1)
+        axes = plates.axes[rows].clone()
+        axes[:, :, 0] *= side
+        centers = plates.centers[rows] + plates.half[rows, :1] * axes[:, :, 0]
+        parts.append((centers, axes, plates.half[rows, 1:], plates.half[rows, 0]))
+    centers, axes, half, noise = (torch.cat(column) for column in zip(*parts, strict=True))
+    nothing = noise[:0]
+    tree = native.face_tree(centers, axes, half, nothing)
+    return Faces(centers, axes, half, nothing, noise, tree)
+
+
+def plates_of(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Faces:
+    """Plates, which have a thickness, with a tree to search them."""
+    given = (centers, axes, half, thickness)
+    return Faces(*given, thickness[:0], native.face_tree(*given))
