@@ -136,6 +136,35 @@ class LardHilbertMap(parameters.MapParameters):
         )
 
     @torch.no_grad()
+    def query_cubes(self, axes: Sequence[Tensor], firsts: Tensor, edge: int) -> Any:
+        """Log-odds on cubes of a lattice; None if the native library does not support this map.
+
+        Args:
+            axes: D lists of world coordinates [m], float64.
+            firsts: (B, D) int64, place on the axes of the first point of each cube.
+            edge: points along an edge of a cube.
+        """
+        if not native.supports(self.centers):
+            return None
+        local = [
+            to_map_frame(axis, shift, self.centers.dtype)
+            for axis, shift in zip(axes, self.origin, strict=True)
+        ]
+        tensors = (self.centers, self.raw_scale_tril, self.weights)
+        return native.cube_log_odds(local, firsts, edge, tensors, self.kernel, self._fresh_index())
+
+    @torch.no_grad()
+    def query_gradient(self, points: Tensor) -> Any:
+        """Gradient of the log-odds at (N, D) world positions, float64 [1/m].
+
+        None if the native library does not support this map.
+        """
+        if len(self) == 0 or not native.supports(self.centers):
+            return None
+        local = self._to_map_frame(points)
+        return native.point_gradients(local, *self._tensors(), index=self._fresh_index()).double()
+
+    @torch.no_grad()
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
         """`raycasting.raycast` in the native library; None if it does not support this map.
 

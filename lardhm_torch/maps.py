@@ -122,6 +122,22 @@ def native_lattice(model: OccupancyMap, axes: list[Tensor], probability: bool) -
     return model.query_lattice(axes, probability=probability)
 
 
+def native_cubes(
+    model: OccupancyMap, axes: list[Tensor], firsts: Tensor, edge: int
+) -> Tensor | None:
+    """Log-odds on cubes of a lattice by the map's ``query_cubes``; None if it is not available."""
+    if getattr(model, "query_cubes", None) is None:
+        return None
+    return model.query_cubes(axes, firsts, edge)  # type: ignore[attr-defined]
+
+
+def native_gradient(model: OccupancyMap, points: Tensor) -> Tensor | None:
+    """(N, D) gradients of the log-odds by the map's ``query_gradient``; None if not available."""
+    if getattr(model, "query_gradient", None) is None:
+        return None
+    return model.query_gradient(points)  # type: ignore[attr-defined]
+
+
 def native_ranges(
     model: OccupancyMap,
     origins: Tensor,

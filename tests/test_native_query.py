@@ -227,3 +227,37 @@ def test_wrong_shapes_and_types_are_refused_by_name(ops):
         ops.nearest(points, centers, 0, index)
     with pytest.raises(RuntimeError, match="index must be a uint8"):
         ops.nearest(points, centers, 5, index.float())
+
+
+@dtypes
+@dims
+@pytest.mark.parametrize("edge", [1, 3, 9])
+def test_cubes_of_a_lattice_are_answered_as_their_points_are(ops, dtype, dim, edge):
+    parameters, rng = make_map(60, dim, dtype), torch.Generator().manual_seed(0)
+    index = ops.build_index(parameters[0], 5)
+    axes = [torch.linspace(-4, 4, 30 + d, dtype=dtype) for d in range(dim)]
+    firsts = torch.randint(0, 30 - edge + 1, (50, dim), generator=rng)
+    found = native.cube_log_odds(axes, firsts, edge, parameters, kernel(5), index)
+    steps = torch.cartesian_prod(*[torch.arange(edge)] * dim).reshape(-1, dim)
+    places = firsts[:, None] + steps
+    points = torch.stack([axes[d][places[..., d]] for d in range(dim)], dim=-1)
+    expected = ops.occupancy(points.reshape(-1, dim), *parameters, *kernel(5), index, False)
+    assert found.shape == (50, *[edge] * dim)
+    torch.testing.assert_close(found.reshape(-1), expected)
+
+
+def test_cubes_outside_of_their_lattice_are_refused(ops):
+    parameters = make_map(7, 3, torch.float32)
+    index, axes = ops.build_index(parameters[0], 5), [torch.zeros(9)] * 3
+    for first in (1, -1):
+        with pytest.raises(RuntimeError, match="cubes must lie in the lattice"):
+            native.cube_log_odds(axes, torch.full((1, 3), first), 9, parameters, kernel(5), index)
+
+
+@dtypes
+def test_gradients_by_points_are_those_of_autograd(ops, dtype):
+    parameters, points = make_map(60, 3, dtype), make_points(200, 3, dtype).requires_grad_()
+    index = ops.build_index(parameters[0], 5)
+    ops.occupancy(points, *parameters, *kernel(5), index, False).sum().backward()
+    found = native.point_gradients(points.detach(), *parameters, kernel(5), index)
+    torch.testing.assert_close(found, points.grad)

@@ -22,7 +22,7 @@ from lardhm_torch.queries.grids import (
     map_bounds,
     query_grid,
 )
-from lardhm_torch.surfaces.meshing import BLOCK_CELLS, active_blocks
+from lardhm_torch.surfaces.lattice import BLOCK_CELLS, Lattice, blocks_near_boxes
 
 GRID_SUFFIXES = (".bt", ".npz", ".ot")
 _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
@@ -117,15 +117,14 @@ def _known_cells(
     model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Centers (n, 3) and log-odds (n,) of the known cells, some blocks that hold clusters a time."""
-    lower, upper = (box.cpu() for box in cluster_boxes(model))
     cells = ((last - first) / resolution).round().long() + 1
-    corner = first - 0.5 * resolution
-    touching = ((upper >= corner) & (lower <= last + 0.5 * resolution)).all(dim=1)
-    lower, upper = (((box[touching] - corner) / resolution).clamp(min=0) for box in (lower, upper))
+    corner = (first / resolution - 0.5).round().long()
+    lattice = Lattice(corner.numpy(), cells.numpy(), resolution)
     local = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
     parts = (torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 3) * resolution).double()
-    for blocks in active_blocks(lower, upper, cells).split(BLOCK_POINTS // (8 * len(local))):
-        index = (blocks[:, None] * BLOCK_CELLS + local).reshape(-1, 3)
+    places = torch.from_numpy(lattice.place(blocks_near_boxes(lattice, *cluster_boxes(model))))
+    for some in places.split(BLOCK_POINTS // (8 * len(local))):
+        index = (some[:, None] + local).reshape(-1, 3)
         centers = first + resolution * index[(index < cells).all(dim=1)].double()
         points = (centers[:, None] + parts).to(model.origin.device)
         log_odds = model.log_odds(points).float().amax(dim=1).cpu()

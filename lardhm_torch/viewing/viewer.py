@@ -17,7 +17,8 @@ import numpy as np
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.maps import OccupancyMap, snapshot
 from lardhm_torch.scans import Scans
-from lardhm_torch.surfaces.meshing import SurfaceLattice, lattice_mesh, surface_lattice
+from lardhm_torch.surfaces.lattice import Lattice
+from lardhm_torch.surfaces.meshing import lattice_mesh, surface_lattice
 from lardhm_torch.surfaces.vertex_colors import COLORS, has_variance
 from lardhm_torch.viewing.scene import Stage, core_box, view_resolution
 
@@ -73,7 +74,7 @@ class MapViewer:
         self._core = core_box(self._model)
         self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
         self._stage = Stage(self.server, self.offset)
-        self._lattice: SurfaceLattice | None = None
+        self._lattice: Lattice | None = None
         self._report = ""
         self._jobs: set[str] = {"map"}
         self._changed = threading.Condition()
@@ -216,13 +217,13 @@ class MapViewer:
             self._report = self._draw_surface(model, self._lattice)
         self._status.content = self._report
 
-    def _draw_surface(self, model: OccupancyMap, lattice: SurfaceLattice) -> str:
+    def _draw_surface(self, model: OccupancyMap, lattice: Lattice | None) -> str:
         """Show the surface; returns the status line."""
         mesh = lattice_mesh(model, lattice, float(self._threshold.value), color=self._color.value)
         shown = self._stage.draw_surface(mesh)
         return (
             f"{len(model.weights):,} clusters; surface of {len(mesh.faces):,} faces, "
-            f"{shown:,} shown, cells of {lattice.resolution:.3g} m. "
+            f"{shown:,} shown, cells of {lattice.resolution if lattice else 0:.3g} m. "
             f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
         )
 
