@@ -6,8 +6,9 @@
 
 Half of at most 120,000 rays of a set train a default map (`room`: the simulated room). Every mesh is
 extracted in a process of its own, after a coarse one has loaded the libraries. Memory is the peak of
-the process, of which the libraries take about 350 MB. With ``--same-map``, surfaces are compared by 300,000 random points on
-each: the fraction within 0.01 m of the other surface, of those that have it within a cell.
+the process, of which the libraries take about 350 MB. With ``--same-map``, surfaces are compared by
+300,000 random points on each: the fraction within 0.01 m of the other surface, of those that have it
+within a cell. Set OMP_NUM_THREADS=1 on a busy machine: waiting threads count as CPU time.
 """
 
 from __future__ import annotations

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
-MAX_CELLS = 1 << 17  # along an axis of a grid or mesh: beyond it memory runs out
-
 
 def query(arguments: argparse.Namespace) -> None:
     """Compute the probability of occupancy at points."""
@@ -48,7 +46,7 @@ def mesh(arguments: argparse.Namespace) -> None:
 
     check_output(arguments.output, MESH_SUFFIXES, [arguments.map])
     model = open_map(arguments.map)
-    _check_resolution(model, arguments.resolution)
+    _check_resolution(arguments.resolution)
     surface = _surface(model, arguments)
     save_mesh(surface, arguments.output)
     print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
@@ -61,7 +59,7 @@ def grid(arguments: argparse.Namespace) -> None:
 
     check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
     model = open_map(arguments.map)
-    _check_resolution(model, arguments.resolution)
+    _check_resolution(arguments.resolution)
     count = save_grid(model, arguments.output, arguments.resolution)
     print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
@@ -79,7 +77,7 @@ def view(arguments: argparse.Namespace) -> None:
     _check_address(arguments.host, arguments.port)
     model = open_map(arguments.map)
     if arguments.resolution is not None:
-        _check_resolution(model, arguments.resolution)
+        _check_resolution(arguments.resolution)
     scans = read_scans(arguments, model.dim) if arguments.scans else None
     config = ViewConfig(host=arguments.host, port=arguments.port, resolution=arguments.resolution)
     viewer = MapViewer(model, scans, config)
@@ -117,7 +115,7 @@ def render(arguments: argparse.Namespace) -> None:
 
     check_output(arguments.output, (".png",), [arguments.map])
     model = open_map(arguments.map)
-    _check_resolution(model, arguments.resolution)
+    _check_resolution(arguments.resolution)
     if arguments.slice is not None or model.dim == 2:
         render_slice(model, arguments.output, arguments.slice, arguments.resolution)
         print(f"slice -> {arguments.output}")
@@ -175,21 +173,10 @@ def _surface(model: LardHilbertMap | TiledMap, arguments: argparse.Namespace) ->
     )
 
 
-def _check_resolution(model: LardHilbertMap | TiledMap, resolution: float) -> None:
-    """Raise a ValueError for a cell size that is not positive or would fill the memory."""
-    from lardhm_torch.queries.grids import map_bounds
-
+def _check_resolution(resolution: float) -> None:
+    """Raise a ValueError for a cell size that is not positive."""
     if not 0 < resolution < float("inf"):
         raise ValueError(f"--resolution must be > 0 m and finite; got {resolution}")
-    if len(model) == 0:
-        return
-    lower, upper = map_bounds(model)
-    extent = float((upper - lower).max())
-    if extent / resolution > MAX_CELLS:
-        raise ValueError(
-            f"--resolution must be at least {extent / MAX_CELLS:.2g} m for a map that spans "
-            f"{extent:.1f} m; got {resolution}"
-        )
 
 
 def _is_scans(name: str) -> bool:

@@ -22,9 +22,12 @@ from lardhm_torch.queries.grids import (
     map_bounds,
     query_grid,
 )
+from lardhm_torch.queries.memory import check_memory
 from lardhm_torch.surfaces.lattice import BLOCK_CELLS, Lattice, blocks_near_boxes
 
 GRID_SUFFIXES = (".bt", ".npz", ".ot")
+_COARSE_CELLS = 800  # along the longest axis, to estimate the size of a tree
+_TREE_BYTES = 16  # for each cell near a cluster, known or not
 _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
 
 
@@ -103,6 +106,7 @@ def _octomap_of(
             f"side of zero; the map reaches {reach:.0f} m. Use a larger resolution, or subtract "
             "model.origin from the scans"
         )
+    _check_tree_memory(model, first, last, resolution)
     tree, count = new_tree(resolution), 0
     for centers, log_odds in _known_cells(model, first, last, resolution):
         for center, value in zip(to_array(centers), log_odds.tolist(), strict=True):
@@ -110,6 +114,19 @@ def _octomap_of(
         count += len(centers)
     tree.updateInnerOccupancy()
     return tree, count
+
+
+def _check_tree_memory(model: OccupancyMap, first: Tensor, last: Tensor, resolution: float) -> None:
+    """Raise a ValueError if the known cells would not fit in memory, by the volume near clusters."""
+    coarse = float((last - first).max()) / _COARSE_CELLS + resolution
+    corner = (first / coarse).floor().long()
+    cells = (last / coarse).floor().long() - corner + 1
+    lattice = Lattice(corner.numpy(), cells.numpy(), coarse)
+    blocks = blocks_near_boxes(lattice, *cluster_boxes(model))
+    volume = float(lattice.marched_cells(blocks).prod(axis=1).sum()) * coarse**3
+    count = volume / resolution**3
+    what = f"the tree would have up to {count / 1e6:.3g} million cells"
+    check_memory(what, resolution, _TREE_BYTES * count, power=3)
 
 
 @torch.no_grad()

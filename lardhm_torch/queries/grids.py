@@ -17,6 +17,7 @@ from lardhm_torch.maps import (
     to_tensor,
 )
 from lardhm_torch.native import build_index, nearest_centers
+from lardhm_torch.queries.memory import check_memory
 
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # half edge of a cluster's box; a kernel is exp(-3^2 / 2) = 1 % of its peak there
@@ -99,10 +100,12 @@ def grid_axes(
         raise ValueError(
             f"lower and upper must be finite; got {lower.tolist()} and {upper.tolist()}"
         )
-    counts = ((upper - lower) / resolution + 1e-6).floor().long() + 1  # 1e-6: 0.3 / 0.1 is 2.99...
+    counts = ((upper - lower) / resolution + 1e-6).floor() + 1  # 1e-6: 0.3 / 0.1 is 2.99...
+    length = float(counts.sum())
+    check_memory(f"an axis would have {length:.3g} points", resolution, 8 * length, power=1)
     return [
-        start + resolution * torch.arange(int(count), dtype=torch.float64, device=lower.device)
-        for start, count in zip(lower, counts, strict=True)
+        start + resolution * torch.arange(count, dtype=torch.float64, device=lower.device)
+        for start, count in zip(lower, counts.long().tolist(), strict=True)
     ]
 
 
@@ -121,11 +124,17 @@ def query_grid(
         (n1, ..., nD) in the dtype and on the device of the map, without gradient.
 
     Raises:
-        ValueError: as for `grid`; or the corners do not have the dimension of the map.
+        ValueError: as for `grid`; the corners do not have the dimension of the map; or the grid would
+            not fit in memory.
     """
     axes = grid_axes(lower, upper, resolution, model.origin.device)
     if len(axes) != model.dim:
         raise ValueError(f"lower and upper must have {model.dim} coordinates; got {len(axes)}")
+    points = math.prod(len(axis) for axis in axes)
+    needed = 2 * model.centers.element_size() * points
+    check_memory(
+        f"the grid would have {points / 1e6:.3g} million points", resolution, needed, len(axes)
+    )
     return lattice_values(model, axes, probability=True)
 
 

@@ -7,7 +7,7 @@ the surface and not with the volume.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -73,8 +73,7 @@ def follow_surface(
     starts: np.ndarray,
     rule: Rule,
     allowed: np.ndarray | None = None,
-    *,
-    progress: bool = False,
+    report: Callable[[int], object] = lambda _: None,
 ) -> Sheet:
     """The parts of a level set that can be reached from some blocks over supported faces.
 
@@ -88,28 +87,26 @@ def follow_surface(
         starts: (B,) ascending numbers of the blocks to begin with.
         rule: which surface.
         allowed: ascending numbers of the blocks that may be evaluated; None: all.
-        progress: show a progress bar.
+        report: called with the number of new faces after each batch of blocks.
     """
-    from tqdm import tqdm
-
     found = _Found(lattice)
     pending = starts
-    with tqdm(desc="mesh", unit=" faces", disable=None if progress else True) as bar:
-        while len(pending):
-            later = [np.zeros(0, dtype=np.int64)]
-            for rows, part, region in _regions(model, lattice, pending):
-                follower = _Follower(part, lattice, rule)
-                todo = found.unknown(pending[rows])
-                while len(todo):
-                    batch, rest = todo[:BATCH_BLOCKS], todo[BATCH_BLOCKS:]
-                    wanted = found.unknown(found.add(batch, follower.examine(batch)))
-                    if allowed is not None:
-                        wanted = wanted[_among(wanted, allowed)]
-                    inside = region(wanted)
-                    later.append(wanted[~inside])
-                    todo = np.union1d(rest, wanted[inside])
-                    bar.update(found.num_faces - bar.n)
-            pending = found.unknown(np.unique(np.concatenate(later)))
+    while len(pending):
+        later = [np.zeros(0, dtype=np.int64)]
+        for rows, part, region in _regions(model, lattice, pending):
+            follower = _Follower(part, lattice, rule)
+            todo = found.unknown(pending[rows])
+            while len(todo):
+                batch, rest = todo[:BATCH_BLOCKS], todo[BATCH_BLOCKS:]
+                before = found.num_faces
+                wanted = found.unknown(found.add(batch, follower.examine(batch)))
+                report(found.num_faces - before)
+                if allowed is not None:
+                    wanted = wanted[_among(wanted, allowed)]
+                inside = region(wanted)
+                later.append(wanted[~inside])
+                todo = np.union1d(rest, wanted[inside])
+        pending = found.unknown(np.unique(np.concatenate(later)))
     return found.sheet()
 
 

@@ -54,6 +54,13 @@ class Lattice:
         ]
         self._kept: dict[int, np.ndarray] | None = {} if keep else None
 
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper corner (3,), world frame [m]."""
+        ends = self.first, self.first + self.cells
+        lower, upper = (torch.from_numpy(end * self.resolution) for end in ends)
+        return lower, upper
+
     def place(self, blocks: np.ndarray) -> np.ndarray:
         """(B,) numbers of blocks -> (B, 3) their first points, in cells from the first point."""
         return np.stack(np.unravel_index(blocks, self.shape), axis=1) * BLOCK_CELLS

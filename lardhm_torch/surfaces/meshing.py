@@ -15,6 +15,7 @@ from lardhm_torch.queries.grids import (
     grid_axes,
     threshold_log_odds,
 )
+from lardhm_torch.surfaces.estimate import check_mesh_memory, estimate_mesh
 from lardhm_torch.surfaces.following import Rule, follow_surface, seed_blocks
 from lardhm_torch.surfaces.lattice import Lattice, blocks_near_boxes, border_blocks
 from lardhm_torch.surfaces.ridge import sheet_on_ridge
@@ -72,7 +73,8 @@ def extract_mesh(
         Mesh in world coordinates [m]; without faces if the map has no such surface.
 
     Raises:
-        ValueError: the map is not 3-D or is empty, or an argument is outside its range.
+        ValueError: the map is not 3-D or is empty, an argument is outside its range, or the mesh would
+            not fit in memory.
         RuntimeError: color is "variance" and the posterior of the map has not been computed.
 
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
@@ -112,9 +114,11 @@ def surface_lattice(
     Returns:
         The lattice; None if no supporting cluster is near the bounds.
     """
-    lower, upper = (box.cpu().numpy() for box in cluster_boxes(model, _sign(threshold)))
+    sign, corners = _sign(threshold), None
+    lower, upper = (box.cpu().numpy() for box in cluster_boxes(model, sign))
     if bounds is not None:
         corner, end = (to_tensor(b, "bounds").cpu() for b in bounds)
+        corners = corner, end
         if len(grid_axes(corner, end, resolution)) != 3:
             raise ValueError(f"bounds must have 3 coordinates; got {len(corner)}")
         low, high = corner.numpy(), end.numpy()
@@ -122,6 +126,7 @@ def surface_lattice(
         lower, upper = lower[touching], upper[touching]
     if len(lower) == 0:
         return None
+    check_mesh_memory(resolution, estimate_mesh(model, resolution, corners, sign))
     if bounds is None:
         first, last = (
             np.floor(lower.min(axis=0) / resolution),
@@ -146,6 +151,7 @@ def lattice_mesh(
 ) -> trimesh.Trimesh:
     """As `extract_mesh`, on the lattice of this map and this side of 1/2."""
     import trimesh
+    from tqdm import tqdm
 
     if lattice is None:
         return trimesh.Trimesh(process=False)
@@ -159,7 +165,10 @@ def lattice_mesh(
         if lattice.is_cut:  # a surface that comes from outside the bounds crosses them
             starts = np.union1d(starts, border_blocks(lattice, *boxes))
     allowed = starts if evidence is None else None
-    sheet = follow_surface(model, lattice, starts, rule, allowed, progress=progress)
+    expected = estimate_mesh(model, lattice.resolution, lattice.bounds, sign)
+    bar = {"total": expected.faces, "desc": f"mesh, {expected}", "unit": " faces"}
+    with tqdm(**bar, disable=None if progress else True) as counter:
+        sheet = follow_surface(model, lattice, starts, rule, allowed, counter.update)
     if surface == "peak":
         sheet = sheet_on_ridge(model, sheet, lattice.resolution)
     vertices, faces, normals, _ = sheet

@@ -14,6 +14,7 @@ from torch import Tensor
 from lardhm_torch.maps import OccupancyMap, covariance_scale
 from lardhm_torch.queries.grids import query_slice
 from lardhm_torch.scans import Scans
+from lardhm_torch.surfaces.estimate import estimate_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -42,17 +43,15 @@ def core_box(model: OccupancyMap) -> tuple[Tensor, Tensor]:
 def view_resolution(model: OccupancyMap) -> float:
     """Edge of a cell [m] for a surface of about `MESH_FACES` faces.
 
-    The area of the surface is estimated from the occupied clusters, each covering two standard
-    deviations to either side. Thin clusters (first quartile) make cells smaller, down to about
-    `MAX_MESH_FACES` faces, because a surface much thinner than a cell has holes.
+    Thin clusters (first quartile) make cells smaller, down to about `MAX_MESH_FACES` faces, because a
+    surface much thinner than a cell has holes.
     """
     factors = model.scale_tril.detach()[model.weights > 0].double()
     if len(factors) == 0:
         return 0.1
-    axes = torch.linalg.svdvals(factors)  # standard deviations, largest first
-    area = 8 / covariance_scale(model) * float((axes[:, 0] * axes[:, 1]).sum())
-    wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MAX_MESH_FACES))
-    thin = float(axes[:, -1].quantile(0.25))
+    faces = estimate_mesh(model, 1.0).faces
+    wide, fine = ((faces / limit) ** 0.5 for limit in (MESH_FACES, MAX_MESH_FACES))
+    thin = float(torch.linalg.svdvals(factors)[:, -1].quantile(0.25))
     return max(0.02, fine, min(wide, SHEET_CELLS * thin))
 
 
