@@ -43,6 +43,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.streaming import resume_stream as resume_stream
     from lardhm_torch.streaming import stream_scans as stream_scans
     from lardhm_torch.surfaces.meshing import extract_mesh as extract_mesh
+    from lardhm_torch.surfaces.simplification import simplify_mesh as simplify_mesh
     from lardhm_torch.tiles.tiled_map import TiledMap as TiledMap
     from lardhm_torch.viewing.viewer import MapViewer as MapViewer
 
@@ -73,6 +74,7 @@ _NAMES = {
     "simulation": ["simulate_room"],
     "streaming": ["StreamConfig", "real_time", "resume_stream", "stream_scans"],
     "surfaces.meshing": ["extract_mesh"],
+    "surfaces.simplification": ["simplify_mesh"],
     "tiles.tiled_map": ["TiledMap"],
     "viewing.viewer": ["MapViewer"],
 }

@@ -132,6 +132,12 @@ def _file_verbs(verb: Any) -> None:
     _output(sub, "mesh to write: .ply, .obj, .glb, .off or .stl")
     _resolution(sub, 0.05)
     _surface(sub)
+    sub.add_argument(
+        "--faces",
+        type=int,
+        metavar="N",
+        help="simplify the mesh to about N faces (default: do not)",
+    )
 
     sub = verb(queries.grid)
     sub.add_argument("map", metavar="MAP", help=MAP)

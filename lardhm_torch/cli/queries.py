@@ -42,12 +42,17 @@ def query(arguments: argparse.Namespace) -> None:
 def mesh(arguments: argparse.Namespace) -> None:
     """Extract the surface of a map as a mesh."""
     from lardhm_torch.io.mesh_files import MESH_SUFFIXES, save_mesh
+    from lardhm_torch.surfaces.simplification import simplify_mesh
     from lardhm_torch.tiles.tiled_map import open_map
 
     check_output(arguments.output, MESH_SUFFIXES, [arguments.map])
     model = open_map(arguments.map)
     _check_resolution(arguments.resolution)
+    if arguments.faces is not None and arguments.faces < 1:
+        raise ValueError(f"--faces must be at least 1; got {arguments.faces}")
     surface = _surface(model, arguments)
+    if arguments.faces is not None:
+        surface = simplify_mesh(surface, arguments.faces)
     save_mesh(surface, arguments.output)
     print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
 

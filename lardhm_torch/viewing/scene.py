@@ -15,6 +15,7 @@ from lardhm_torch.maps import OccupancyMap, covariance_scale
 from lardhm_torch.queries.grids import query_slice
 from lardhm_torch.scans import Scans
 from lardhm_torch.surfaces.estimate import estimate_mesh
+from lardhm_torch.surfaces.simplification import simplify_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -93,27 +94,6 @@ def ellipsoids(model: OccupancyMap, chosen: Tensor, offset: np.ndarray) -> dict[
         "batched_positions": (centers.numpy() - offset).astype(np.float32),
         "batched_scales": (stds / covariance_scale(model) ** 0.5).numpy().astype(np.float32),
     }
-
-
-def fewer_faces(mesh: trimesh.Trimesh, limit: int = SHOWN_FACES) -> trimesh.Trimesh:
-    """Simplify a mesh to about ``limit`` faces; vertices get the color of the nearest old vertex.
-
-    Source: Garland & Heckbert 1997, quadric error metrics (by fast-simplification).
-    """
-    import trimesh
-    from scipy.spatial import cKDTree
-
-    if len(mesh.faces) <= limit:
-        return mesh
-    import fast_simplification
-
-    vertices, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float32), mesh.faces, target_count=limit
-    )
-    nearest = cKDTree(mesh.vertices).query(vertices)[1]
-    visual: Any = mesh.visual
-    colors = visual.vertex_colors[nearest]
-    return trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
 
 
 def painted_glb(mesh: trimesh.Trimesh) -> bytes:
@@ -218,7 +198,7 @@ class Stage:
             return 0
         moved = mesh.copy()
         moved.apply_translation(-self.offset)
-        shown = fewer_faces(moved)
+        shown = simplify_mesh(moved, SHOWN_FACES)
         scene.add_glb(
             "/surface",
             painted_glb(shown),
