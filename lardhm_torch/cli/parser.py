@@ -141,8 +141,26 @@ def _file_verbs(verb: Any) -> None:
 
     sub = verb(queries.grid)
     sub.add_argument("map", metavar="MAP", help=MAP)
-    _output(sub, "grid to write: .npz, or .bt or .ot for OctoMap")
+    sub.add_argument(
+        "-o", "--output", metavar="FILE", help="grid to write: .npz, or .bt or .ot for OctoMap"
+    )
     _resolution(sub, 0.1)
+    sub.add_argument(
+        "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
+    )
+    sub.add_argument(
+        "--heights",
+        nargs=2,
+        type=finite,
+        metavar=("LOW", "HIGH"),
+        help="with --nav2: z of the lowest and highest obstacles of a 3-D map [m], above the floor",
+    )
+    sub.add_argument(
+        "--mode",
+        choices=("trinary", "scale"),
+        default="trinary",
+        help="with --nav2: three values, or probabilities of known cells (default: trinary)",
+    )
 
 
 def _picture_verbs(verb: Any) -> None:

@@ -60,13 +60,31 @@ def mesh(arguments: argparse.Namespace) -> None:
 def grid(arguments: argparse.Namespace) -> None:
     """Write the probabilities of a map on a grid."""
     from lardhm_torch.io.grid_files import GRID_SUFFIXES, save_grid
+    from lardhm_torch.io.nav2_files import save_nav2
     from lardhm_torch.tiles.tiled_map import open_map
 
-    check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
+    if arguments.output is None and arguments.nav2 is None:
+        raise ValueError("give --output or --nav2, or both")
+    if arguments.nav2 is None and arguments.heights is not None:
+        raise ValueError("--heights needs --nav2; a grid of --output has all heights")
+    if arguments.output is not None:
+        check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
+    if arguments.nav2 is not None:
+        check_output(arguments.nav2, (".yaml", ".yml"), [arguments.map], option="--nav2")
     model = open_map(arguments.map)
     _check_resolution(arguments.resolution)
-    count = save_grid(model, arguments.output, arguments.resolution)
-    print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
+    if arguments.nav2 is not None:
+        columns, rows = save_nav2(
+            model,
+            arguments.nav2,
+            arguments.resolution,
+            heights=arguments.heights and tuple(arguments.heights),
+            mode=arguments.mode,
+        )
+        print(f"{columns} x {rows} cells of {arguments.resolution} m -> {arguments.nav2}")
+    if arguments.output is not None:
+        count = save_grid(model, arguments.output, arguments.resolution)
+        print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 
 def view(arguments: argparse.Namespace) -> None:
