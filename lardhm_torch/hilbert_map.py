@@ -165,6 +165,23 @@ class LardHilbertMap(parameters.MapParameters):
         return native.point_gradients(local, *self._tensors(), index=self._fresh_index()).double()
 
     @torch.no_grad()
+    def query_ridge(self, points: Tensor, strides: Tensor, steps: int, fall: float) -> Any:
+        """`ridge.ridge_positions` in the native library; None if it does not support this map.
+
+        Args:
+            points: (V, D) world positions, float64 [m].
+            strides: (V, D) float64 [m], against which the lines run.
+            steps: along each line.
+            fall: of the log-odds, after which a peak counts.
+        """
+        if not native.supports(self.centers):
+            return None
+        tensors = (self.centers, self.raw_scale_tril, self.weights)
+        return native.ridge_positions(
+            points - self.origin, strides, steps, fall, tensors, self.kernel, self._fresh_index()
+        )
+
+    @torch.no_grad()
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
         """`raycasting.raycast` in the native library; None if it does not support this map.
 

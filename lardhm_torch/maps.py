@@ -138,6 +138,15 @@ def native_gradient(model: OccupancyMap, points: Tensor) -> Tensor | None:
     return model.query_gradient(points)  # type: ignore[attr-defined]
 
 
+def native_ridge(
+    model: OccupancyMap, points: Tensor, strides: Tensor, steps: int, fall: float
+) -> Tensor | None:
+    """(V,) positions of the ridge by the map's ``query_ridge``; None if it is not available."""
+    if getattr(model, "query_ridge", None) is None:
+        return None
+    return model.query_ridge(points, strides, steps, fall)  # type: ignore[attr-defined]
+
+
 def native_ranges(
     model: OccupancyMap,
     origins: Tensor,

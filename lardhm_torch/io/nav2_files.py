@@ -185,8 +185,7 @@ def _write_trinary(log_odds: np.ndarray, path: Path) -> None:
     shades = np.full(log_odds.shape, UNKNOWN, dtype=np.uint8)
     shades[log_odds > 0] = OCCUPIED
     shades[log_odds < 0] = FREE
-    rows, columns = len(shades), shades.shape[-1]
-    path.write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + shades.tobytes())
+    path.write_bytes(f"P5\n{len(shades[0])} {len(shades)}\n255\n".encode() + shades.tobytes())
 
 
 def _write_scale(log_odds: np.ndarray, path: Path) -> None:

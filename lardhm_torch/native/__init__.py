@@ -159,6 +159,35 @@ def point_gradients(
     return torch.ops.lardhm.occupancy_backward(*given, *kernel, index, False, 1)[0]
 
 
+def ridge_positions(
+    points: Tensor,
+    strides: Tensor,
+    steps: int,
+    fall: float,
+    parameters: tuple[Tensor, Tensor, Tensor],
+    kernel: Kernel,
+    index: Tensor,
+) -> Tensor:
+    """As `ridge.ridge_positions`, for a map that `supports` says yes to.
+
+    Args:
+        points: (V, D) float64 in the map's frame [m].
+        strides: (V, D) float64 [m], against which the lines run.
+        steps: along each line.
+        fall: of the log-odds, after which a peak counts.
+        parameters: centers, raw factors, weights of the map.
+        kernel: its settings.
+        index: of the centers.
+    """
+    tensors = (tensor.detach() for tensor in parameters)
+    return torch.ops.lardhm.ridge_positions(points, strides, steps, fall, *tensors, *kernel, index)
+
+
+def mean_with_neighbors(values: Tensor, faces: Tensor) -> Tensor | None:
+    """As `ridge.plain_mean_with_neighbors`; None without the library."""
+    return torch.ops.lardhm.mean_with_neighbors(values, faces) if available() else None
+
+
 def march_blocks(
     values: Tensor, level: float, cells: Tensor, table: Tensor
 ) -> tuple[Tensor, Tensor, Tensor] | None:
@@ -271,6 +300,14 @@ def _register() -> None:
     @library.register_fake("lardhm::cube_log_odds")
     def _(axes: Tensor, shape: list[int], firsts: Tensor, edge: int, *_: Any) -> Tensor:
         return axes.new_empty(firsts.shape[0], *[edge] * len(shape))
+
+    @library.register_fake("lardhm::ridge_positions")
+    def _(points: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(points.shape[0])
+
+    @library.register_fake("lardhm::mean_with_neighbors")
+    def _(values: Tensor, faces: Tensor) -> Tensor:
+        return torch.empty_like(values)
 
     @library.register_fake("lardhm::march_blocks")
     def _(values: Tensor, *_: Any) -> tuple[Tensor, ...]:

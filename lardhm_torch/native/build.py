@@ -33,7 +33,7 @@ FLAGS = (
 # last two do without.
 UNITS = (
     ("query", "kmeans", "gradients", "descent"),
-    ("raycast", "update", "pooling", "selecting", "cells", "marching", "threads"),
+    ("raycast", "update", "pooling", "selecting", "cells", "marching", "ridge", "threads"),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
 )

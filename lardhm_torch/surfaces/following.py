@@ -244,8 +244,10 @@ class _Found:
         self.vertices.append((batch.points, batch.normals, batch.thickness))
         is_supported = np.zeros(len(edges.axes), dtype=bool)
         is_supported[batch.rows] = True
-        begun = corners[np.logical_or.reduce(is_supported[corners.T])]
-        kept = corners[np.logical_and.reduce((is_supported | ~edges.is_owned)[corners.T])]
+        first, second, third = is_supported[corners].T
+        begun = corners[first | second | third]
+        first, second, third = (is_supported | ~edges.is_owned)[corners].T
+        kept = corners[first & second & third]
         number = np.zeros(len(is_supported), dtype=np.int64)
         number[batch.rows] = self.num_vertices + np.arange(len(batch.rows))
         foreign = np.flatnonzero(~edges.is_owned)

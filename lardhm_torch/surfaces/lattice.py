@@ -128,6 +128,15 @@ class Lattice:
         return found.float().cpu().numpy()
 
 
+_SLOT = np.arange(SLOTS)
+_PLACES: np.ndarray = np.stack(
+    np.unravel_index(_SLOT // 3, (POINTS,) * 3), axis=1
+)  # (SLOTS, 3) in the block
+_AXES = _SLOT % 3
+_IS_OWNED: np.ndarray = (_PLACES < BLOCK_CELLS).all(axis=1)
+_IS_ON_BORDER: np.ndarray = ((_PLACES == 0) | (_PLACES == BLOCK_CELLS)).any(axis=1)
+
+
 class Edges(NamedTuple):
     """Lattice edges of a batch of blocks that the surface crosses.
 
@@ -148,15 +157,17 @@ class Edges(NamedTuple):
     @staticmethod
     def of(lattice: Lattice, blocks: np.ndarray, edges: np.ndarray, shares: np.ndarray) -> Edges:
         """From what `marching.march_blocks` returns for these blocks."""
-        number, slot = np.divmod(edges, SLOTS)
-        point, axes = np.divmod(slot, 3)
-        local = np.stack(np.unravel_index(point, (POINTS,) * 3))
-        first = lattice.place(blocks).T[:, number]
-        last = lattice.marched_cells(blocks).T[:, number]
-        at_end = first + local == lattice.cells[:, None]
-        is_owned = np.logical_and.reduce((local < last) | at_end)
-        is_on_border = np.logical_or.reduce((local == 0) | (local == last))
-        return Edges((first + local).T, axes, shares, is_owned, is_on_border)
+        number = edges // SLOTS
+        slot = edges - SLOTS * number
+        first = lattice.place(blocks)
+        points = first[number] + _PLACES[slot]
+        is_owned, is_on_border = _IS_OWNED[slot], _IS_ON_BORDER[slot]
+        at_end = (first + BLOCK_CELLS >= lattice.cells).any(axis=1)
+        rows = np.flatnonzero(at_end[number])  # there are blocks that own more and are smaller
+        local, last = _PLACES[slot[rows]], lattice.marched_cells(blocks)[number[rows]]
+        is_owned[rows] = ((local < last) | (points[rows] == lattice.cells)).all(axis=1)
+        is_on_border[rows] |= (local == last).any(axis=1)
+        return Edges(points, _AXES[slot], shares, is_owned, is_on_border)
 
     def select(self, rows: np.ndarray) -> Edges:
         """The edges of some rows or of a mask."""

@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap
+from lardhm_torch import native
+from lardhm_torch.maps import OccupancyMap, native_ridge
+from lardhm_torch.queries.grids import EVIDENCE
 from lardhm_torch.queries.raycasting import first_peak, parabola_vertex
 from lardhm_torch.surfaces.following import Sheet
 
@@ -35,16 +37,24 @@ def ridge_depths(
         (V,) depths against the normals [m]; NaN if the peak is at either end of the `MAX_DEPTH`
         standard deviations searched.
     """
-    numbers = torch.arange(STEPS + 1, device=vertices.device)[:, None, None]
-    strides = thickness * (MAX_DEPTH / STEPS)
-    depths = [strides.new_zeros(0)]
-    for start, step in zip(
-        vertices.split(CHUNK_VERTICES),
-        (normals * strides[:, None]).split(CHUNK_VERTICES),
-        strict=True,
-    ):
-        depths.append(_peak_position(model.log_odds(start - numbers * step).double().T))
-    return torch.cat(depths) * strides
+    strides = thickness.double() * (MAX_DEPTH / STEPS)
+    return strides * ridge_positions(model, vertices, normals * strides[:, None])
+
+
+def ridge_positions(model: OccupancyMap, points: Tensor, strides: Tensor) -> Tensor:
+    """(V, D) points [m] and strides [m] -> (V,) strides back to the first peak of the log-odds.
+
+    NaN if the peak is at either end of the `STEPS` strides.
+    """
+    found = native_ridge(model, points, strides, STEPS, EVIDENCE)
+    if found is not None:
+        return found
+    numbers = torch.arange(STEPS + 1, device=points.device)[:, None, None]
+    chunks = zip(points.split(CHUNK_VERTICES), strides.split(CHUNK_VERTICES), strict=True)
+    positions = [
+        _peak_position(model.log_odds(start - numbers * step).double().T) for start, step in chunks
+    ]
+    return torch.cat([points.new_zeros(0), *positions])
 
 
 def _peak_position(log_odds: Tensor) -> Tensor:
@@ -88,9 +98,11 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
 
 def _turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(F,) whether a face looks against the normals of its vertices."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    return sum((across * normals[faces[:, corner]]).sum(axis=1) for corner in range(3)) <= 0
+    a, b, c = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
+    first, second = (b - a).astype(np.float32), (c - a).astype(np.float32)
+    looks = sum(normals.take(faces[:, corner], axis=0) for corner in range(3))
+    across = torch.linalg.cross(torch.from_numpy(first), torch.from_numpy(second)).numpy()
+    return np.einsum("ij,ij->i", across, looks) <= 0
 
 
 def mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -103,6 +115,13 @@ def mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Returns:
         (V, C), NaN where neither the vertex nor any neighbor has a value.
     """
+    arrays = (torch.from_numpy(a) for a in (values.astype(np.float64), faces.astype(np.int64)))
+    found = native.mean_with_neighbors(*arrays)
+    return plain_mean_with_neighbors(values, faces) if found is None else found.numpy()
+
+
+def plain_mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """`mean_with_neighbors` in NumPy."""
     known = (~np.isnan(values).any(axis=1)).astype(np.float64)
     columns = np.column_stack([known, np.where(known[:, None] > 0, values, 0.0)]).T
     sums = columns.copy()
