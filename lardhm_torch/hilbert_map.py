@@ -17,6 +17,7 @@ from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.maps import TensorLike
+from lardhm_torch.native.surfaces import NativeMap
 from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame, training_points
 from lardhm_torch.sampling import seeded_generator
 
@@ -135,51 +136,12 @@ class LardHilbertMap(parameters.MapParameters):
             local, *self._tensors(), probability=probability, index=self._fresh_index()
         )
 
-    @torch.no_grad()
-    def query_cubes(self, axes: Sequence[Tensor], firsts: Tensor, edge: int) -> Any:
-        """Log-odds on cubes of a lattice; None if the native library does not support this map.
-
-        Args:
-            axes: D lists of world coordinates [m], float64.
-            firsts: (B, D) int64, place on the axes of the first point of each cube.
-            edge: points along an edge of a cube.
-        """
-        if not native.supports(self.centers):
-            return None
-        local = [
-            to_map_frame(axis, shift, self.centers.dtype)
-            for axis, shift in zip(axes, self.origin, strict=True)
-        ]
-        tensors = (self.centers, self.raw_scale_tril, self.weights)
-        return native.cube_log_odds(local, firsts, edge, tensors, self.kernel, self._fresh_index())
-
-    @torch.no_grad()
-    def query_gradient(self, points: Tensor) -> Any:
-        """Gradient of the log-odds at (N, D) world positions, float64 [1/m].
-
-        None if the native library does not support this map.
-        """
+    def native_map(self) -> NativeMap | None:
+        """The tensors of the map for the native library; None if it does not support this map."""
         if len(self) == 0 or not native.supports(self.centers):
             return None
-        local = self._to_map_frame(points)
-        return native.point_gradients(local, *self._tensors(), index=self._fresh_index()).double()
-
-    @torch.no_grad()
-    def query_ridge(self, points: Tensor, strides: Tensor, steps: int, fall: float) -> Any:
-        """`ridge.ridge_positions` in the native library; None if it does not support this map.
-
-        Args:
-            points: (V, D) world positions, float64 [m].
-            strides: (V, D) float64 [m], against which the lines run.
-            steps: along each line.
-            fall: of the log-odds, after which a peak counts.
-        """
-        if not native.supports(self.centers):
-            return None
-        tensors = (self.centers, self.raw_scale_tril, self.weights)
-        return native.ridge_positions(
-            points - self.origin, strides, steps, fall, tensors, self.kernel, self._fresh_index()
-        )
+        tensors = (self.centers.detach(), self.raw_scale_tril.detach(), self.weights.detach())
+        return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
 
     @torch.no_grad()
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:

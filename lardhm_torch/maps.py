@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.native.surfaces import NativeMap
+
 TensorLike: TypeAlias = Tensor | np.ndarray | Sequence[object]  # types accepted by `to_tensor`
 
 
@@ -122,29 +124,9 @@ def native_lattice(model: OccupancyMap, axes: list[Tensor], probability: bool) -
     return model.query_lattice(axes, probability=probability)
 
 
-def native_cubes(
-    model: OccupancyMap, axes: list[Tensor], firsts: Tensor, edge: int
-) -> Tensor | None:
-    """Log-odds on cubes of a lattice by the map's ``query_cubes``; None if it is not available."""
-    if getattr(model, "query_cubes", None) is None:
-        return None
-    return model.query_cubes(axes, firsts, edge)  # type: ignore[attr-defined]
-
-
-def native_gradient(model: OccupancyMap, points: Tensor) -> Tensor | None:
-    """(N, D) gradients of the log-odds by the map's ``query_gradient``; None if not available."""
-    if getattr(model, "query_gradient", None) is None:
-        return None
-    return model.query_gradient(points)  # type: ignore[attr-defined]
-
-
-def native_ridge(
-    model: OccupancyMap, points: Tensor, strides: Tensor, steps: int, fall: float
-) -> Tensor | None:
-    """(V,) positions of the ridge by the map's ``query_ridge``; None if it is not available."""
-    if getattr(model, "query_ridge", None) is None:
-        return None
-    return model.query_ridge(points, strides, steps, fall)  # type: ignore[attr-defined]
+def native_map(model: OccupancyMap) -> NativeMap | None:
+    """The tensors of the map for `native.surfaces` by its ``native_map``; None if not available."""
+    return model.native_map() if hasattr(model, "native_map") else None
 
 
 def native_ranges(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lardhm_torch import features
 from lardhm_torch.features import Kernel
+from lardhm_torch.native import surfaces
 from lardhm_torch.native.build import available as library_available
 
 DIMENSIONS = (2, 3)
@@ -117,86 +118,6 @@ def lattice_occupancy(
     return torch.cat(slabs)
 
 
-def cube_log_odds(
-    axes: list[Tensor],
-    firsts: Tensor,
-    edge: int,
-    parameters: tuple[Tensor, Tensor, Tensor],
-    kernel: Kernel,
-    index: Tensor,
-) -> Tensor:
-    """Log-odds at cubes of ``edge``^D points of a lattice, for a map that `supports` says yes to.
-
-    Args:
-        axes: D lists of finite coordinates in the map's frame [m].
-        firsts: (B, D) int64, place on the axes of the first point of each cube.
-        edge: points along an edge.
-        parameters: centers, raw factors, weights of the map.
-        kernel: its settings.
-        index: of the centers.
-
-    Returns:
-        (B, edge, ..., edge).
-    """
-    shape = [len(axis) for axis in axes]
-    tensors = (tensor.detach() for tensor in parameters)
-    return torch.ops.lardhm.cube_log_odds(
-        torch.cat(axes), shape, firsts, edge, *tensors, *kernel, index
-    )
-
-
-def point_gradients(
-    points: Tensor,
-    centers: Tensor,
-    raw_scale_tril: Tensor,
-    weights: Tensor,
-    kernel: Kernel,
-    index: Tensor,
-) -> Tensor:
-    """Gradients of the log-odds by (N, D) points, for a map that `supports` says yes to."""
-    tensors = (points, centers, raw_scale_tril, weights)
-    given = (torch.ones_like(points[:, 0]), *(tensor.detach() for tensor in tensors))
-    return torch.ops.lardhm.occupancy_backward(*given, *kernel, index, False, 1)[0]
-
-
-def ridge_positions(
-    points: Tensor,
-    strides: Tensor,
-    steps: int,
-    fall: float,
-    parameters: tuple[Tensor, Tensor, Tensor],
-    kernel: Kernel,
-    index: Tensor,
-) -> Tensor:
-    """As `ridge.ridge_positions`, for a map that `supports` says yes to.
-
-    Args:
-        points: (V, D) float64 in the map's frame [m].
-        strides: (V, D) float64 [m], against which the lines run.
-        steps: along each line.
-        fall: of the log-odds, after which a peak counts.
-        parameters: centers, raw factors, weights of the map.
-        kernel: its settings.
-        index: of the centers.
-    """
-    tensors = (tensor.detach() for tensor in parameters)
-    return torch.ops.lardhm.ridge_positions(points, strides, steps, fall, *tensors, *kernel, index)
-
-
-def mean_with_neighbors(values: Tensor, faces: Tensor) -> Tensor | None:
-    """As `ridge.plain_mean_with_neighbors`; None without the library."""
-    return torch.ops.lardhm.mean_with_neighbors(values, faces) if available() else None
-
-
-def march_blocks(
-    values: Tensor, level: float, cells: Tensor, table: Tensor
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """As `marching.plain_march`; None without the library."""
-    if not available():
-        return None
-    return torch.ops.lardhm.march_blocks(values, level, cells, table)
-
-
 def raycast(
     rays: tuple[Tensor, Tensor],
     march: tuple[float, float, float, float, bool],
@@ -297,24 +218,6 @@ def _register() -> None:
     def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:
         return axes.new_empty(shape)
 
-    @library.register_fake("lardhm::cube_log_odds")
-    def _(axes: Tensor, shape: list[int], firsts: Tensor, edge: int, *_: Any) -> Tensor:
-        return axes.new_empty(firsts.shape[0], *[edge] * len(shape))
-
-    @library.register_fake("lardhm::ridge_positions")
-    def _(points: Tensor, *_: Any) -> Tensor:
-        return points.new_empty(points.shape[0])
-
-    @library.register_fake("lardhm::mean_with_neighbors")
-    def _(values: Tensor, faces: Tensor) -> Tensor:
-        return torch.empty_like(values)
-
-    @library.register_fake("lardhm::march_blocks")
-    def _(values: Tensor, *_: Any) -> tuple[Tensor, ...]:
-        vertices, faces = (library.get_ctx().new_dynamic_size() for _ in range(2))
-        edges = values.new_empty(vertices, dtype=torch.long)
-        return edges, values.new_empty(vertices), values.new_empty(faces, 3, dtype=torch.int32)
-
     @library.register_fake("lardhm::raycast")
     def _(origins: Tensor, *_: Any) -> Tensor:
         return origins.new_empty(origins.shape[0])
@@ -376,6 +279,7 @@ def _register() -> None:
     def _(counts: Tensor, means: Tensor, scatters: Tensor, raw: Tensor, *_: Any) -> Any:
         return tuple(torch.empty_like(t) for t in (counts, means, scatters, means, raw))
 
+    surfaces.register()
     library.register_autograd("lardhm::occupancy", _backward, setup_context=_keep_inputs)
 
 

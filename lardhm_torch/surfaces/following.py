@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, local_parts, native_gradient, pieces
+from lardhm_torch.maps import OccupancyMap, local_parts, native_map, pieces
+from lardhm_torch.native.surfaces import point_gradients
 from lardhm_torch.queries.grids import SupportingClusters, occupancy_gradient
 from lardhm_torch.surfaces.lattice import BLOCK_CELLS, SLOTS, Edges, Lattice
 from lardhm_torch.surfaces.marching import Faces, march_blocks
@@ -184,8 +185,10 @@ class _Follower:
         return _Batch(edges, cut, rows, *(column.cpu().numpy() for column in columns))
 
     def _normals(self, points: Tensor) -> Tensor:
-        gradient = native_gradient(self.model, points)
-        if gradient is None:
+        tensors = native_map(self.model)
+        if tensors is not None:
+            gradient = point_gradients(tensors, points)
+        else:
             gradient = occupancy_gradient(self.model, points)
         return -torch.nn.functional.normalize(gradient, dim=1)
 

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, native_cubes
+from lardhm_torch.maps import OccupancyMap, native_map
+from lardhm_torch.native.surfaces import cube_log_odds
 
 BLOCK_CELLS = 8  # along an edge of a block
 POINTS = BLOCK_CELLS + 1  # along an edge: neighboring blocks share a plane of points
@@ -107,25 +108,17 @@ class Lattice:
 
     @torch.no_grad()
     def _evaluate(self, model: OccupancyMap, blocks: np.ndarray) -> np.ndarray:
-        firsts = torch.from_numpy(self.place(blocks))
-        found = native_cubes(model, self._axes, firsts, POINTS)
-        if found is None:
-            steps = torch.arange(POINTS)
-            index = [firsts[:, axis, None] + steps for axis in range(3)]
-            x, y, z = (
-                line[i].to(model.origin.device) for line, i in zip(self._axes, index, strict=True)
-            )
-            shape = (len(blocks), POINTS, POINTS, POINTS)
-            points = torch.stack(
-                [
-                    x[:, :, None, None].expand(shape),
-                    y[:, None, :, None].expand(shape),
-                    z[:, None, None, :].expand(shape),
-                ],
-                dim=-1,
-            )
-            found = model.log_odds(points)
-        return found.float().cpu().numpy()
+        firsts, tensors = torch.from_numpy(self.place(blocks)), native_map(model)
+        if tensors is not None:
+            return cube_log_odds(tensors, self._axes, firsts, POINTS).float().numpy()
+        steps = torch.arange(POINTS)
+        shape = (len(blocks), POINTS, POINTS, POINTS)
+        points = torch.empty(*shape, 3, dtype=torch.float64)
+        for axis, line in enumerate(self._axes):
+            along = [1, 1, 1]
+            along[axis] = POINTS
+            points[..., axis] = line[firsts[:, axis, None] + steps].reshape(-1, *along)
+        return model.log_odds(points.to(model.origin.device)).float().cpu().numpy()
 
 
 _SLOT = np.arange(SLOTS)
@@ -133,8 +126,8 @@ _PLACES: np.ndarray = np.stack(
     np.unravel_index(_SLOT // 3, (POINTS,) * 3), axis=1
 )  # (SLOTS, 3) in the block
 _AXES = _SLOT % 3
-_IS_OWNED: np.ndarray = (_PLACES < BLOCK_CELLS).all(axis=1)
-_IS_ON_BORDER: np.ndarray = ((_PLACES == 0) | (_PLACES == BLOCK_CELLS)).any(axis=1)
+_IS_OWNED = np.asarray((_PLACES < BLOCK_CELLS).all(axis=1))
+_IS_ON_BORDER = np.asarray(((_PLACES == 0) | (_PLACES == BLOCK_CELLS)).any(axis=1))
 
 
 class Edges(NamedTuple):
@@ -161,8 +154,8 @@ class Edges(NamedTuple):
         slot = edges - SLOTS * number
         first = lattice.place(blocks)
         points = first[number] + _PLACES[slot]
-        is_owned, is_on_border = _IS_OWNED[slot], _IS_ON_BORDER[slot]
-        at_end = (first + BLOCK_CELLS >= lattice.cells).any(axis=1)
+        is_owned, is_on_border = _IS_OWNED.take(slot), _IS_ON_BORDER.take(slot)
+        at_end = np.asarray((first + BLOCK_CELLS >= lattice.cells).any(axis=1))
         rows = np.flatnonzero(at_end[number])  # there are blocks that own more and are smaller
         local, last = _PLACES[slot[rows]], lattice.marched_cells(blocks)[number[rows]]
         is_owned[rows] = ((local < last) | (points[rows] == lattice.cells)).all(axis=1)

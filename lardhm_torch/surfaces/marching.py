@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lardhm_torch import native
+from lardhm_torch.native import available
+from lardhm_torch.native.surfaces import march_blocks as native_march
 
 # Corner 4 i + 2 j + k of a cell is at (i, j, k). Edge 4 axis + n runs along the axis from its nth base
 # corner, in ascending order of the corners.
@@ -52,10 +53,10 @@ def march_blocks(values: np.ndarray, level: float, cells: np.ndarray) -> Faces:
 
     Source: Lorensen & Cline 1987.
     """
-    arrays = (torch.from_numpy(array) for array in (cells, case_table()))
-    found = native.march_blocks(torch.from_numpy(values), level, *arrays)
-    if found is None:
+    if not available():
         return plain_march(values, level, cells)
+    arrays = (torch.from_numpy(array) for array in (cells, case_table()))
+    found = native_march(torch.from_numpy(values), level, *arrays)
     return Faces(*(tensor.numpy() for tensor in found))
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
-from lardhm_torch.maps import OccupancyMap, native_ridge
+from lardhm_torch.maps import OccupancyMap, native_map
+from lardhm_torch.native import available
+from lardhm_torch.native import surfaces as native
 from lardhm_torch.queries.grids import EVIDENCE
 from lardhm_torch.queries.raycasting import first_peak, parabola_vertex
 from lardhm_torch.surfaces.following import Sheet
@@ -46,9 +47,9 @@ def ridge_positions(model: OccupancyMap, points: Tensor, strides: Tensor) -> Ten
 
     NaN if the peak is at either end of the `STEPS` strides.
     """
-    found = native_ridge(model, points, strides, STEPS, EVIDENCE)
-    if found is not None:
-        return found
+    tensors = native_map(model)
+    if tensors is not None:
+        return native.ridge_positions(tensors, points, strides, STEPS, EVIDENCE)
     numbers = torch.arange(STEPS + 1, device=points.device)[:, None, None]
     chunks = zip(points.split(CHUNK_VERTICES), strides.split(CHUNK_VERTICES), strict=True)
     positions = [
@@ -115,9 +116,10 @@ def mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Returns:
         (V, C), NaN where neither the vertex nor any neighbor has a value.
     """
+    if not available():
+        return plain_mean_with_neighbors(values, faces)
     arrays = (torch.from_numpy(a) for a in (values.astype(np.float64), faces.astype(np.int64)))
-    found = native.mean_with_neighbors(*arrays)
-    return plain_mean_with_neighbors(values, faces) if found is None else found.numpy()
+    return native.mean_with_neighbors(*arrays).numpy()
 
 
 def plain_mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
