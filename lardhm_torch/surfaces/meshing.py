@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -148,8 +149,12 @@ def lattice_mesh(
     color: str | None = "height",
     evidence: float | None = EVIDENCE,
     progress: bool = False,
+    report: Callable[[int], object] = lambda _: None,
 ) -> trimesh.Trimesh:
-    """As `extract_mesh`, on the lattice of this map and this side of 1/2."""
+    """As `extract_mesh`, on the lattice of this map and this side of 1/2.
+
+    ``report`` is called with the number of new faces now and then; what it raises ends the work.
+    """
     import trimesh
     from tqdm import tqdm
 
@@ -168,9 +173,13 @@ def lattice_mesh(
     expected = estimate_mesh(model, lattice.resolution, lattice.bounds, sign)
     bar = {"total": expected.faces, "desc": f"mesh, {expected}", "unit": " faces"}
     with tqdm(**bar, disable=None if progress else True) as counter:
-        sheet = follow_surface(model, lattice, starts, rule, allowed, counter.update)
+        sheet = follow_surface(
+            model, lattice, starts, rule, allowed, lambda n: (counter.update(n), report(n))
+        )
+    report(0)
     if surface == "peak":
         sheet = sheet_on_ridge(model, sheet, lattice.resolution)
+        report(0)
     vertices, faces, normals, _ = sheet
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True

@@ -31,14 +31,20 @@ KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light baked into t
 
 
 def core_box(model: OccupancyMap) -> tuple[Tensor, Tensor]:
-    """Lower and upper corner (3,) of the box to show, world frame [m].
+    """Lower and upper corner (3,) of the box to show, world frame [m]. A flat map is at height 0.
 
     From the 2 % to the 98 % quantile of the centers of the occupied clusters, plus 0.5 m.
     """
     occupied = model.weights > 0
     centers = model.centers[occupied if bool(occupied.any()) else ...].detach().double().cpu()
     ends = torch.quantile(centers, torch.tensor([0.02, 0.98], dtype=torch.float64), dim=0)
-    return ends[0] + model.origin.cpu() - 0.5, ends[1] + model.origin.cpu() + 0.5
+    lower, upper = ends[0] + model.origin.cpu() - 0.5, ends[1] + model.origin.cpu() + 0.5
+    return (lower, upper) if model.dim == 3 else (in_space(lower), in_space(upper))
+
+
+def in_space(positions: Tensor) -> Tensor:
+    """(..., 2) or (..., 3) positions -> (..., 3), flat ones at height 0."""
+    return torch.nn.functional.pad(positions, (0, 3 - positions.shape[-1]))
 
 
 def view_resolution(model: OccupancyMap) -> float:
@@ -59,11 +65,15 @@ def view_resolution(model: OccupancyMap) -> float:
 def slice_picture(
     model: OccupancyMap, height: float, core: tuple[Tensor, Tensor], offset: np.ndarray
 ) -> dict[str, Any]:
-    """Slice of the probability at a height above the offset [m], as arguments of `add_image`."""
+    """Slice of the probability at a height above the offset [m], as arguments of `add_image`.
+
+    Of a flat map, all of it.
+    """
     from matplotlib import colormaps
 
     pixel = float((core[1] - core[0])[:2].max()) / SLICE_PIXELS
-    probability, extent = query_slice(model, height + float(offset[2]), pixel, core)
+    level = height + float(offset[2]) if model.dim == 3 else None
+    probability, extent = query_slice(model, level, pixel, core)
     p = probability.float().cpu().numpy().T[::-1]  # first row at the largest y
     image = colormaps["RdBu_r"](p, bytes=True)
     image[..., 3] = np.clip(np.abs(p - 0.5) * 1000, 40, 235)  # unknown is nearly transparent
@@ -127,7 +137,7 @@ def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarra
     from matplotlib import colormaps
 
     hits = scans.hits
-    hits = hits[hits.isfinite().all(dim=1)].cpu()
+    hits = in_space(hits[hits.isfinite().all(dim=1)].cpu())
     points = thinned((hits.numpy() - offset).astype(np.float32), limit)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
@@ -246,7 +256,7 @@ class Stage:
         points, colors = scan_points(scans, limit, self.offset)
         scene = self.server.scene
         scene.add_point_cloud("/scans", points, colors, point_size=0.02, precision="float32")
-        origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
+        origins = (in_space(scans.origins.cpu()).numpy() - self.offset).astype(np.float32)
         scene.add_point_cloud(
             "/sensors", origins, (255, 150, 0), point_size=0.12, point_shape="circle"
         )
@@ -257,10 +267,11 @@ class Stage:
         self.server.scene.get_handle_by_name("/scans").point_size = size
 
     def aim(self, core: tuple[Tensor, Tensor]) -> None:
-        """Place the camera obliquely above the box, far enough to see all of it."""
+        """Place the camera so far that it sees the whole box: obliquely above, or above a flat one."""
         low, high = (end.numpy() - self.offset for end in core)
         distance = max(float(np.linalg.norm(high - low)), 1.0)
+        direction = np.array([0.25, -0.5, 0.5] if high[2] > low[2] else [0.0, -0.01, 0.8])
         camera = self.server.initial_camera
         camera.look_at = tuple((low + high) / 2)
-        camera.position = tuple((low + high) / 2 + distance * np.array([0.25, -0.5, 0.5]))
+        camera.position = tuple((low + high) / 2 + distance * direction)
         self.server.scene.set_up_direction("+z")
