@@ -146,6 +146,9 @@ def _file_verbs(verb: Any) -> None:
     )
     _resolution(sub, 0.1)
     sub.add_argument(
+        "--sparse", action="store_true", help="with .npz: only blocks of cells near clusters"
+    )
+    sub.add_argument(
         "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
     )
     sub.add_argument(

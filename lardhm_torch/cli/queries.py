@@ -67,6 +67,8 @@ def grid(arguments: argparse.Namespace) -> None:
         raise ValueError("give --output or --nav2, or both")
     if arguments.nav2 is None and arguments.heights is not None:
         raise ValueError("--heights needs --nav2; a grid of --output has all heights")
+    if arguments.sparse and arguments.output is None:
+        raise ValueError("--sparse needs --output")
     if arguments.output is not None:
         check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
     if arguments.nav2 is not None:
@@ -83,7 +85,7 @@ def grid(arguments: argparse.Namespace) -> None:
         )
         print(f"{columns} x {rows} cells of {arguments.resolution} m -> {arguments.nav2}")
     if arguments.output is not None:
-        count = save_grid(model, arguments.output, arguments.resolution)
+        count = save_grid(model, arguments.output, arguments.resolution, sparse=arguments.sparse)
         print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 

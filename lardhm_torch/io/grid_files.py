@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +29,7 @@ from lardhm_torch.surfaces.lattice import BLOCK_CELLS, Lattice, blocks_near_boxe
 
 GRID_SUFFIXES = (".bt", ".npz", ".ot")
 _COARSE_CELLS = 800  # along the longest axis, to estimate the size of a tree
-_TREE_BYTES = 16  # for each cell near a cluster, known or not
+_TREE_BYTES = 8  # for each cell near a cluster: most are unknown or merged
 _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
 
 
@@ -36,6 +38,8 @@ def save_grid(
     path: str | os.PathLike[str],
     resolution: float = 0.1,
     bounds: tuple[TensorLike, TensorLike] | None = None,
+    *,
+    sparse: bool = False,
 ) -> int:
     """Write the map as a grid of cells, in the format of the extension.
 
@@ -47,6 +51,11 @@ def save_grid(
     | ``.bt`` | OctoMap: occupied and free cells, the rest unknown |
     | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511) |
 
+    A sparse ``.npz`` holds only blocks of 8 x 8 x 8 cells that a cluster's box of three standard
+    deviations touches: ``probability`` (B, 8, 8, 8) float32 and ``blocks`` (B, 3), the first cell of
+    each, counted from the one at ``lower``. All other cells are unknown. It is written block by block,
+    so memory does not grow with the map.
+
     An OctoMap cell has the highest log-odds of the centers of its eight parts, since surfaces are
     thinner than cells and OctoMap too lets occupied win. It is known where they are 1 or more away
     from 0 (probability 0.27, 0.73).
@@ -56,13 +65,14 @@ def save_grid(
         path: a file that ends in .npz, .bt or .ot; an old one is replaced at the end.
         resolution: edge of a cell [m].
         bounds: lower and upper corner of the part to write, world frame [m]; None: all of it.
+        sparse: write a sparse ``.npz``, of a 3-D map.
 
     Returns:
         The number of cells written.
 
     Raises:
-        ValueError: the extension is another, the map is empty or has the wrong dimension, or the
-            map lies outside what an OctoMap of this resolution spans.
+        ValueError: the extension is another, the map is empty or has the wrong dimension, the map lies
+            outside what an OctoMap of this resolution spans, or the grid would not fit in memory.
         ImportError: an OctoMap is asked for and octomap-python is not installed.
         FileNotFoundError: the folder of path does not exist.
     """
@@ -70,11 +80,18 @@ def save_grid(
     if suffix not in GRID_SUFFIXES:
         known = ", ".join(GRID_SUFFIXES)
         raise ValueError(f"path must end in one of {known} for a grid; got {Path(path).name!r}")
+    if sparse and (suffix != ".npz" or model.dim != 3):
+        raise ValueError(
+            f"sparse needs a path that ends in .npz and a 3-D map; got {Path(path).name!r} and "
+            f"{model.dim}-D. OctoMap trees are sparse anyway"
+        )
     lower, upper = map_bounds(model) if bounds is None else bounds
     lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in (lower, upper))
     grid_axes(lower, upper, resolution)  # raises for what is no resolution and no corners
     first, last = (lower / resolution).floor(), (upper / resolution).ceil() - 1
     first_center, last_center = ((end + 0.5) * resolution for end in (first, last.maximum(first)))
+    if sparse:
+        return _save_sparse(model, path, resolution, first_center, last_center)
     if suffix == ".npz":
         probability = query_grid(model, first_center, last_center, resolution)
         with replaced_file(path) as partial, open(partial, "wb") as file:
@@ -91,6 +108,52 @@ def save_grid(
         if not write(os.fsencode(partial)):
             raise OSError(f"{path} cannot be written")
     return count
+
+
+@torch.no_grad()
+def _save_sparse(
+    model: OccupancyMap,
+    path: str | os.PathLike[str],
+    resolution: float,
+    first: Tensor,
+    last: Tensor,
+) -> int:
+    """Write the cells of all blocks near clusters; returns how many."""
+    lattice, places = _blocks_of_cells(model, first, last, resolution)
+    axes = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
+    shape = (len(places), *[BLOCK_CELLS] * 3)
+    small = {
+        "blocks": places.numpy(),
+        "lower": (first - 0.5 * resolution).numpy(),
+        "resolution": np.float64(resolution),
+        "cells": lattice.cells,
+    }
+    with (
+        replaced_file(path) as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as file,
+    ):
+        for name, array in small.items():
+            with file.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, np.asanyarray(array))
+        with file.open("probability.npy", "w", force_zip64=True) as member:
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(member, header)
+            for some in places.split(BLOCK_POINTS // len(axes)):
+                points = first + resolution * (some[:, None] + axes).double()
+                probability = model(points.to(model.origin.device)).float().cpu().numpy()
+                member.write(probability.astype("<f4").tobytes())
+    return math.prod(shape)
+
+
+def _blocks_of_cells(
+    model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
+) -> tuple[Lattice, Tensor]:
+    """Cells between two centers as a lattice, and the first cells (B, 3) of blocks near clusters."""
+    cells = ((last - first) / resolution).round().long() + 1
+    corner = (first / resolution - 0.5).round().long()
+    lattice = Lattice(corner.numpy(), cells.numpy(), resolution)
+    near = blocks_near_boxes(lattice, *cluster_boxes(model))
+    return lattice, torch.from_numpy(lattice.place(near))
 
 
 def _octomap_of(
@@ -110,9 +173,8 @@ def _octomap_of(
     tree, count = new_tree(resolution), 0
     for centers, log_odds in _known_cells(model, first, last, resolution):
         for center, value in zip(to_array(centers), log_odds.tolist(), strict=True):
-            tree.updateNode(center, value, True)
+            tree.updateNode(center, value, False)  # not lazy: equal cells are merged on the way
         count += len(centers)
-    tree.updateInnerOccupancy()
     return tree, count
 
 
@@ -134,12 +196,10 @@ def _known_cells(
     model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Centers (n, 3) and log-odds (n,) of the known cells, some blocks that hold clusters a time."""
-    cells = ((last - first) / resolution).round().long() + 1
-    corner = (first / resolution - 0.5).round().long()
-    lattice = Lattice(corner.numpy(), cells.numpy(), resolution)
+    lattice, places = _blocks_of_cells(model, first, last, resolution)
+    cells = torch.from_numpy(lattice.cells)
     local = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
     parts = (torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 3) * resolution).double()
-    places = torch.from_numpy(lattice.place(blocks_near_boxes(lattice, *cluster_boxes(model))))
     for some in places.split(BLOCK_POINTS // (8 * len(local))):
         index = (some[:, None] + local).reshape(-1, 3)
         centers = first + resolution * index[(index < cells).all(dim=1)].double()
