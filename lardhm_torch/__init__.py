@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.hilbert_map import LardHilbertMap as LardHilbertMap
     from lardhm_torch.io.grid_files import save_grid as save_grid
     from lardhm_torch.io.mesh_files import save_mesh as save_mesh
+    from lardhm_torch.io.nav2_files import save_nav2 as save_nav2
     from lardhm_torch.io.notes import ScanReport as ScanReport
     from lardhm_torch.io.scan_files import iter_scans as iter_scans
     from lardhm_torch.io.scan_files import load_points as load_points
@@ -50,6 +51,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.streaming import resume_stream as resume_stream
     from lardhm_torch.streaming import stream_scans as stream_scans
     from lardhm_torch.surfaces.meshing import extract_mesh as extract_mesh
+    from lardhm_torch.surfaces.simplification import simplify_mesh as simplify_mesh
     from lardhm_torch.tiles.tiled_map import TiledMap as TiledMap
     from lardhm_torch.viewing.viewer import MapViewer as MapViewer
 
@@ -58,6 +60,7 @@ _NAMES = {
     "hilbert_map": ["LardHilbertMap"],
     "io.grid_files": ["save_grid"],
     "io.mesh_files": ["save_mesh"],
+    "io.nav2_files": ["save_nav2"],
     "io.notes": ["ScanReport"],
     "io.scan_files": ["iter_scans", "load_points", "load_scans", "save_scans"],
     "learning.fine_tuning": ["TuneConfig", "fine_tune"],
@@ -83,6 +86,7 @@ _NAMES = {
     "simulation": ["simulate_room"],
     "streaming": ["StreamConfig", "real_time", "resume_stream", "stream_scans"],
     "surfaces.meshing": ["extract_mesh"],
+    "surfaces.simplification": ["simplify_mesh"],
     "tiles.tiled_map": ["TiledMap"],
     "viewing.viewer": ["MapViewer"],
 }

@@ -17,6 +17,7 @@ from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.maps import TensorLike
+from lardhm_torch.native.surfaces import NativeMap
 from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame, training_points
 from lardhm_torch.sampling import seeded_generator
 
@@ -136,6 +137,13 @@ class LardHilbertMap(parameters.MapParameters):
         return native.lattice_occupancy(
             local, *self._tensors(), probability=probability, index=self._fresh_index()
         )
+
+    def native_map(self) -> NativeMap | None:
+        """The tensors of the map for the native library; None if it does not support this map."""
+        if len(self) == 0 or not native.supports(self.centers):
+            return None
+        tensors = (self.centers.detach(), self.raw_scale_tril.detach(), self.weights.detach())
+        return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
 
     @torch.no_grad()
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
@@ -361,16 +369,6 @@ class LardHilbertMap(parameters.MapParameters):
         """Posterior of some weights, which stays valid where these keep their features."""
         means, variances = self.posterior_means[rows], self.posterior_variances[rows]
         return means.clone(), variances.clone(), self.posterior_scales.clone()
-
-    def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
-        """Parameter groups for an optimizer, with weight decay on the weights only.
-
-        Weight decay would pull centers to the map's origin and length-scales to 1 m.
-        """
-        return [
-            {"params": [self.weights], "weight_decay": weight_decay},
-            {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
-        ]
 
     # --- files ---
 

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.native.surfaces import NativeMap
+
 TensorLike: TypeAlias = Tensor | np.ndarray | Sequence[object]  # types accepted by `to_tensor`
 
 
@@ -120,6 +122,11 @@ def native_lattice(model: OccupancyMap, axes: list[Tensor], probability: bool) -
     if not hasattr(model, "query_lattice"):
         return None
     return model.query_lattice(axes, probability=probability)
+
+
+def native_map(model: OccupancyMap) -> NativeMap | None:
+    """The tensors of the map for `native.surfaces` by its ``native_map``; None if not available."""
+    return model.native_map() if hasattr(model, "native_map") else None
 
 
 def native_ranges(

@@ -45,8 +45,9 @@ def main(folder: Path) -> None:
     scores = mesh_metrics(mesh, room_mesh(), train.hits)
     print("mesh " + ", ".join(f"{name} {value:.4f}" for name, value in scores.items()))
 
-    render_mesh(mesh, folder / "mesh.png", cut_above=2.3)  # without the ceiling
-    render_slice(model, folder / "slice.png", height=1.0)
+    render_mesh(mesh, folder / "mesh.png", cut_above=2.28)  # without the ceiling
+    room = ([-0.5, -0.5], [8.5, 5.5])  # without what was seen through the doorway and the window
+    render_slice(model, folder / "slice.png", height=1.0, bounds=room)
     print("wrote " + ", ".join(str(path) for path in sorted(folder.iterdir())))
 
 

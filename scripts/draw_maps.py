@@ -11,6 +11,7 @@ from typing import Any
 
 from lardhm_torch import LardHilbertMap, extract_mesh, load_scans, sample_rays
 from lardhm_torch.viewing.rendering import render_mesh
+from lardhm_torch.viewing.scene import core_box
 
 VIEWS: dict[str, dict[str, Any]] = {  # 7-Scenes is in the frame of its first camera: -y is up
     "sevenscenes_rgbd": {"up": (0, -1, 0), "azimuth": -105, "elevation": 25},
@@ -31,7 +32,7 @@ def main() -> None:
         started = time.perf_counter()
         samples = sample_rays(load_scans(arguments.data / name / "scans.npz"))
         model = LardHilbertMap().fit(samples.points, samples.labels)
-        mesh = extract_mesh(model, RESOLUTION[name])
+        mesh = extract_mesh(model, RESOLUTION[name], bounds=core_box(model))
         picture = arguments.output / f"{name}.png"
         render_mesh(mesh, picture, size=(900, 600), **view)
         print(f"{picture}: {len(mesh.faces)} faces, {time.perf_counter() - started:.1f} s")

@@ -13,7 +13,7 @@ from lardhm_torch.viewing.viewer import MapViewer
 
 
 def main(scans_path: str, picture: Path) -> None:
-    """Show the surface, the points and the sensors."""
+    """Show the surface and the sensors; points would hide a room behind its ceiling."""
     scans = load_scans(scans_path)
     samples = sample_rays(scans)
     viewer = MapViewer(LardHilbertMap().fit(samples.points, samples.labels), scans)
@@ -24,6 +24,7 @@ def main(scans_path: str, picture: Path) -> None:
         page.get_by_text("surface of").wait_for()
         if page.locator(".mantine-Notification-closeButton").count():
             page.locator(".mantine-Notification-closeButton").first.click()
+        page.get_by_label("show points").click()
         page.wait_for_timeout(15_000)
         page.screenshot(path=picture)
     viewer.close()

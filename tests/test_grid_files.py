@@ -62,6 +62,40 @@ def test_bounds_cut_out_the_cells_they_touch(room, tmp_path):
         assert cells["probability"].shape == (3, 4, 1)
 
 
+def test_a_sparse_grid_holds_the_cells_of_the_dense_one_and_the_rest_is_unknown(room, tmp_path):
+    save_grid(room, tmp_path / "dense.npz", 0.15)
+    count = save_grid(room, tmp_path / "sparse.npz", 0.15, sparse=True)
+    with np.load(tmp_path / "dense.npz") as cells:
+        dense, lower = cells["probability"], cells["lower"]
+    with np.load(tmp_path / "sparse.npz") as cells:
+        blocks, values = cells["blocks"], cells["probability"]
+        assert np.allclose(cells["lower"], lower)
+        assert cells["cells"].tolist() == list(dense.shape)
+        assert float(cells["resolution"]) == 0.15
+    assert values.shape == (len(blocks), 8, 8, 8)
+    assert values.dtype == np.float32
+    assert count == values.size
+    whole = np.full([-(-n // 8) * 8 for n in dense.shape], 0.5, dtype=np.float32)
+    for (i, j, k), block in zip(blocks, values, strict=True):
+        whole[i : i + 8, j : j + 8, k : k + 8] = block
+    whole = whole[tuple(slice(n) for n in dense.shape)]
+    stored = whole != 0.5
+    assert np.allclose(whole[stored], dense[stored], atol=1e-5)
+    assert np.abs(dense[~stored] - 0.5).max(initial=0) < 0.05
+    with pytest.raises(ValueError, match=r"sparse needs a path that ends in \.npz and a 3-D map"):
+        save_grid(room, tmp_path / "map.bt", sparse=True)
+
+
+def test_a_sparse_grid_of_few_places_far_apart_is_small(tmp_path):
+    points = torch.rand(200, 3, dtype=torch.float64)
+    points[100:, :2] += 1000  # [m]
+    model = LardHilbertMap().fit(points, torch.ones(200), 20)
+    count = save_grid(model, tmp_path / "grid.npz", 0.1, sparse=True)
+    assert count < 500_000  # the whole box has 1.6e9 cells
+    with np.load(tmp_path / "grid.npz") as cells:
+        assert (cells["probability"] > 0.9).sum() > 1000
+
+
 def test_a_flat_map_gives_a_flat_grid_and_no_octomap(tmp_path):
     points = torch.rand(200, 2)
     model = LardHilbertMap(2).fit(points, (points[:, 0] > 0.5).long(), 20)

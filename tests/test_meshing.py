@@ -4,14 +4,18 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
+from small_maps import wall_map
 from torch import nn
 
-from lardhm_torch import LardHilbertMap, sample_rays, simulate_room, split_rays
+from lardhm_torch import LardHilbertMap, grid, sample_rays, simulate_room, split_rays
 from lardhm_torch.evaluation.mesh_distances import mesh_metrics
 from lardhm_torch.simulation import room_mesh
-from lardhm_torch.surfaces import meshing, ridge
+from lardhm_torch.surfaces import following, meshing, ridge
+from lardhm_torch.surfaces.following import Sheet
+from lardhm_torch.surfaces.marching import plain_march
 from lardhm_torch.surfaces.meshing import extract_mesh
-from lardhm_torch.surfaces.ridge import mean_with_neighbors, mesh_on_ridge
+from lardhm_torch.surfaces.ridge import mean_with_neighbors, sheet_on_ridge
 
 
 class GaussianMap(nn.Module):
@@ -95,21 +99,67 @@ def test_normals_point_into_free_space():
     assert ((mesh.face_normals * mesh.triangles_center).sum(axis=1) > 0).all()
 
 
+def triangles(mesh):
+    """(F, 9) corners of all triangles in one order, whatever that of the mesh."""
+    corners = mesh.triangles.round(5)
+    first = np.lexsort(corners.transpose(2, 0, 1)[::-1], axis=-1)[:, 0]  # each begins at its lowest
+    turned = np.take_along_axis(corners, (first[:, None] + np.arange(3))[..., None] % 3, axis=1)
+    flat = turned.reshape(-1, 9)
+    return flat[np.lexsort(flat.T[::-1])]
+
+
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("cells", [3, 7, 20])
-def test_the_mesh_does_not_depend_on_the_blocks(seed, cells, monkeypatch):
+def test_the_mesh_is_that_of_the_whole_lattice(seed):
     model, bounds = random_map(seed), ([-1.6] * 3, [1.6] * 3)
-    monkeypatch.setattr(meshing, "BLOCK_CELLS", 40)  # all of it in one block
-    whole = level_mesh(model, 0.08, 0.7, bounds, evidence=None)
-    monkeypatch.setattr(meshing, "BLOCK_CELLS", cells)
-    blocks = level_mesh(model, 0.08, 0.7, bounds, evidence=None)
+    mesh = level_mesh(model, 0.08, 0.7, bounds, evidence=None)
+    with torch.no_grad():
+        values = model.log_odds(grid(*bounds, 0.08)).numpy().astype(np.float32)
+    cut = plain_march(values[None], math.log(0.7 / 0.3), np.array([[40, 40, 40]]))
+    points, axes = np.divmod(cut.edges, 3)
+    places = np.stack(np.unravel_index(points, values.shape), axis=1).astype(float)
+    places[np.arange(len(places)), axes] += cut.shares
+    whole = trimesh.Trimesh(0.08 * places - 1.6, cut.faces, process=False)
     assert len(whole.faces) > 500
-    assert blocks.is_watertight == whole.is_watertight
-    assert len(blocks.vertices) == len(whole.vertices)
-    # the sets of triangles agree whatever their order
-    corners = [np.sort(m.triangles.round(5).reshape(-1, 9), axis=1) for m in (blocks, whole)]
-    np.testing.assert_allclose(*(c[np.lexsort(c.T)] for c in corners), atol=2e-5)
-    assert blocks.volume == pytest.approx(whole.volume)
+    assert len(mesh.vertices) == len(whole.vertices)
+    np.testing.assert_allclose(triangles(mesh), triangles(whole), atol=2e-5)
+
+
+def test_parts_of_a_map_fit_together():
+    model = wall_seen_from_the_left()
+    whole = extract_mesh(model, 0.04)
+    ends = [-3.2, -0.4, 3.2]  # in y: all but the tails, without the center of the cluster
+    low, high = [-0.8, ends[0], -3.2], [0.8, ends[1], 3.2]
+    parts = [extract_mesh(model, 0.04, bounds=(low, high))]
+    low[1], high[1] = ends[1:]
+    parts.append(extract_mesh(model, 0.04, bounds=(low, high)))
+    assert min(len(part.faces) for part in parts) > 300
+    assert sum(part.area for part in parts) == pytest.approx(whole.area, rel=0.01)
+    seams = [part.vertices[np.abs(part.vertices[:, 1] - ends[1]) < 1e-3] for part in parts]
+    distance, _ = cKDTree(seams[0]).query(seams[1])
+    assert len(seams[1]) > 20
+    assert (distance < 1e-3).mean() > 0.95  # all but the ends of the seam
+
+
+def test_following_finds_what_examining_every_block_finds():
+    model = wall_map(dtype=torch.float32)
+    rule = following.Rule(0.0, 1, 1.0)
+    lattice = meshing.surface_lattice(model, 0.03)
+    every = np.arange(int(lattice.shape.prod()))
+    starts = following.seed_blocks(model, lattice, rule)
+    found, expected = (
+        following.follow_surface(model, lattice, blocks, rule) for blocks in (starts, every)
+    )
+    assert 0 < len(starts) < 0.3 * len(every)
+    assert len(expected.faces) > 1000
+    assert len(found.faces) == len(expected.faces)
+
+
+def test_kept_log_odds_give_the_same_mesh_again():
+    model = ball_in_free_space()
+    lattice = meshing.surface_lattice(model, 0.05, keep=True)
+    first, again = (meshing.lattice_mesh(model, lattice) for _ in range(2))
+    np.testing.assert_array_equal(first.vertices, again.vertices)
+    np.testing.assert_array_equal(first.faces, extract_mesh(model, 0.05).faces)
 
 
 def test_only_blocks_near_occupied_clusters_are_evaluated():
@@ -118,7 +168,7 @@ def test_only_blocks_near_occupied_clusters_are_evaluated():
     )
     mesh = level_mesh(model, 0.05, 0.7, color=None, evidence=None)
     assert mesh.body_count == 2
-    assert model.num_points < 20 * 25**3  # all blocks would be 34³ of these
+    assert model.num_points < 20 * 25**3  # the whole lattice would have 800³ points
 
 
 def test_the_mesh_moves_with_the_world():
@@ -248,39 +298,70 @@ def test_a_wall_lies_on_the_ridge_of_the_log_odds_and_its_level_in_front():
     assert in_front.max() < ridge_at - 0.05
 
 
+def facing_away(mesh, truth):
+    """Fraction of the area within 0.1 m of the true surface that looks against all of it there."""
+    points, faces = trimesh.sample.sample_surface(truth, 100_000, seed=0)
+    near = cKDTree(points).query_ball_point(mesh.triangles_center, 0.1)
+    normals, total, away = truth.face_normals[faces], 0.0, 0.0
+    for rows, normal, area in zip(near, mesh.face_normals, mesh.area_faces, strict=True):
+        total += area
+        away += area * bool(len(rows) and (normals[rows] @ normal).max() < 0)
+    return away / total
+
+
 def test_the_mesh_of_a_room_lies_on_its_walls():
     train, _ = split_rays(simulate_room(seed=1), ratio=0.8, seed=1)
     samples = sample_rays(train, seed=1)
     model = LardHilbertMap().fit(samples.points, samples.labels, seed=1)
-    scores = {
-        surface: mesh_metrics(extract_mesh(model, 0.05, surface=surface), room_mesh(), train.hits)
-        for surface in ("peak", "crossing")
+    meshes = {
+        surface: extract_mesh(model, 0.05, surface=surface) for surface in ("peak", "crossing")
     }
+    scores = {
+        surface: mesh_metrics(mesh, room_mesh(), train.hits) for surface, mesh in meshes.items()
+    }
+    assert meshes["peak"].area == pytest.approx(158.5, rel=0.05)  # what the sensors can see of it
+    assert facing_away(meshes["peak"], room_mesh()) < 0.015
     assert scores["peak"]["f_score_0.05"] > 0.85
     assert scores["peak"]["chamfer"] < 0.5 * scores["crossing"]["chamfer"]
 
 
 def test_a_vertex_without_a_ridge_goes_the_way_of_its_neighbors():
-    values = torch.tensor([1.0, torch.nan, 3.0, torch.nan]).double()
-    spread = mean_with_neighbors(values, torch.tensor([[0, 1, 2]]))
-    torch.testing.assert_close(
-        spread, torch.tensor([2.0, 2.0, 2.0, torch.nan]).double(), equal_nan=True
-    )
+    values = np.array([[1.0], [np.nan], [3.0], [np.nan]])
+    spread = mean_with_neighbors(values, np.array([[0, 1, 2]]))
+    np.testing.assert_allclose(spread[:, 0], [2.0, 2.0, 2.0, np.nan])
 
 
-def test_a_face_whose_corners_met_different_surfaces_is_left_out(monkeypatch):
+def strip_of_faces():
+    """A flat strip along x, normals up."""
     x = 0.05 * np.arange(20.0)
     lines = [np.stack([x, np.full(20, y), np.zeros(20)], axis=1) for y in (0.0, 0.05)]
     quads = np.arange(19)[:, None]
     faces = np.concatenate([quads + np.array(corners) for corners in ([0, 1, 20], [1, 21, 20])])
-    strip = trimesh.Trimesh(np.concatenate(lines), faces, process=False)
+    normals = np.tile(np.array([0, 0, 1], dtype=np.float32), (40, 1))
+    return Sheet(np.concatenate(lines), faces, normals, np.ones(40, dtype=np.float32))
+
+
+def test_a_face_whose_corners_met_different_surfaces_is_left_out(monkeypatch):
+    strip = strip_of_faces()
     depths = torch.as_tensor(np.where(strip.vertices[:, 0] < 0.5, 0.1, 0.5))
     monkeypatch.setattr(ridge, "ridge_depths", lambda *_: depths)
-    moved = mesh_on_ridge(ball(), strip, 0.05)
-    assert 0 < len(moved.faces) < len(faces)
+    moved = sheet_on_ridge(ball(), strip, 0.05)
+    assert 0 < len(moved.faces) < len(strip.faces)
     heights = np.abs(moved.vertices[:, 2])[moved.faces]
     assert np.ptp(heights, axis=1).max() <= 0.05
     assert {0.1, 0.5} == set(np.abs(moved.vertices[:, 2]).round(9)[[0, -1]])
+
+
+def test_a_face_that_turns_over_is_left_out(monkeypatch):
+    strip = strip_of_faces()
+    strip.normals[10] = [0.8, 0, 0.6]  # moves 0.08 m back, past its neighbor
+    monkeypatch.setattr(ridge, "mean_with_neighbors", lambda values, _: values)
+    monkeypatch.setattr(ridge, "ridge_depths", lambda *_: torch.full((40,), 0.1).double())
+    moved = sheet_on_ridge(ball(), strip, 0.5)
+    corners = moved.vertices[moved.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert len(strip.faces) - 4 < len(moved.faces) < len(strip.faces)
+    assert (across[:, 2] > 0).all()
 
 
 def test_another_surface_is_refused():

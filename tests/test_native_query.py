@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import nearest_centers as plain_nearest
+from lardhm_torch.native.surfaces import NativeMap, cube_log_odds, point_gradients
 
 
 @dtypes
@@ -227,3 +228,40 @@ def test_wrong_shapes_and_types_are_refused_by_name(ops):
         ops.nearest(points, centers, 0, index)
     with pytest.raises(RuntimeError, match="index must be a uint8"):
         ops.nearest(points, centers, 5, index.float())
+
+
+@dtypes
+@dims
+@pytest.mark.parametrize("edge", [1, 3, 9])
+def test_cubes_of_a_lattice_are_answered_as_their_points_are(ops, dtype, dim, edge):
+    parameters, rng = make_map(60, dim, dtype), torch.Generator().manual_seed(0)
+    index = ops.build_index(parameters[0], 5)
+    axes = [torch.linspace(-4, 4, 30 + d, dtype=dtype) for d in range(dim)]
+    firsts = torch.randint(0, 30 - edge + 1, (50, dim), generator=rng)
+    model = NativeMap(*parameters, kernel(5), index, torch.zeros(dim, dtype=torch.float64))
+    found = cube_log_odds(model, axes, firsts, edge)
+    steps = torch.cartesian_prod(*[torch.arange(edge)] * dim).reshape(-1, dim)
+    places = firsts[:, None] + steps
+    points = torch.stack([axes[d][places[..., d]] for d in range(dim)], dim=-1)
+    expected = ops.occupancy(points.reshape(-1, dim), *parameters, *kernel(5), index, False)
+    assert found.shape == (50, *[edge] * dim)
+    torch.testing.assert_close(found.reshape(-1), expected)
+
+
+def test_cubes_outside_of_their_lattice_are_refused(ops):
+    parameters = make_map(7, 3, torch.float32)
+    index, axes = ops.build_index(parameters[0], 5), [torch.zeros(9)] * 3
+    model = NativeMap(*parameters, kernel(5), index, torch.zeros(3, dtype=torch.float64))
+    for first in (1, -1):
+        with pytest.raises(RuntimeError, match="cubes must lie in the lattice"):
+            cube_log_odds(model, axes, torch.full((1, 3), first), 9)
+
+
+@dtypes
+def test_gradients_by_points_are_those_of_autograd(ops, dtype):
+    parameters, points = make_map(60, 3, dtype), make_points(200, 3, dtype).requires_grad_()
+    index = ops.build_index(parameters[0], 5)
+    ops.occupancy(points, *parameters, *kernel(5), index, False).sum().backward()
+    model = NativeMap(*parameters, kernel(5), index, torch.zeros(3, dtype=torch.float64))
+    found = point_gradients(model, points.detach().double())
+    torch.testing.assert_close(found, points.grad.double())

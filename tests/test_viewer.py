@@ -1,6 +1,7 @@
 import importlib.util
 import io
 import json
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,8 +11,9 @@ import trimesh
 from chromium import chromium, chromium_path
 from scipy.spatial import cKDTree
 
-from lardhm_torch import LardHilbertMap, cli, sample_rays, save_scans, simulate_room
+from lardhm_torch import LardHilbertMap, Scans, cli, sample_rays, save_scans, simulate_room
 from lardhm_torch.surfaces import vertex_colors
+from lardhm_torch.surfaces.simplification import simplify_mesh
 from lardhm_torch.viewing import scene
 from lardhm_torch.viewing.viewer import LiveView, MapViewer, ViewConfig
 
@@ -119,6 +121,49 @@ def test_what_is_clicked_in_the_browser_is_seen(model, scans, page):
         shown.close()
 
 
+def flat_scans(scans):
+    """The scans of a room as a 2-D scanner sees them, 1 m to 1.5 m above its floor."""
+    level = (scans.ends[:, 2] > 1) & (scans.ends[:, 2] < 1.5)
+    return Scans(scans.origins[:, :2], scans.ends[level, :2], scans.scan_id[level])
+
+
+def test_a_flat_map_is_a_picture_of_probabilities_with_its_hits_and_sensors(scans, page):
+    flat = flat_scans(scans)
+    samples = sample_rays(flat)
+    model = LardHilbertMap(2).fit(samples.points, samples.labels, 200)
+    shown = MapViewer(model, flat)
+    try:
+        page.goto(shown.url)
+        page.get_by_text(f"{len(model)} clusters").wait_for()
+        shown.wait()
+        both = settled(page)
+        blue = (both[..., 2] - both[..., 0] > 60).mean()
+        red = (both[..., 0] - both[..., 2] > 60).mean()
+        assert blue > red > 0.005
+        page.get_by_label("show points").click()
+        page.get_by_label("show sensors").click()
+        picture = settled(page)
+        assert share_changed(both, picture) > 0.001
+        page.get_by_label("show probability").click()
+        page.wait_for_timeout(1000)
+        shown.wait()
+        assert share_drawn(settled(page)) < 0.02
+        with pytest.raises(ValueError, match="must be a 2-D map to be viewed; got 3-D"):
+            shown.update(LardHilbertMap(3))
+    finally:
+        shown.close()
+
+
+def test_a_viewer_that_is_closed_gives_up_what_it_draws(model):
+    shown = MapViewer(model, config=ViewConfig(resolution=0.004))  # would take minutes
+    worker = shown._worker
+    while not shown._lattices:
+        time.sleep(0.01)
+    shown.close()
+    worker.join(60)
+    assert not worker.is_alive()
+
+
 def test_a_map_under_construction_is_shown_as_it_grows(scans, page):
     samples = sample_rays(scans.select(scans.scan_id == 0))
     model = LardHilbertMap().fit(samples.points, samples.labels, 200)
@@ -169,8 +214,8 @@ def test_the_commands_write_a_scene_and_pictures(model, scans, tmp_path, capsys)
 
 
 def test_a_flat_or_empty_map_is_refused():
-    with pytest.raises(ValueError, match="must be a 3-D map to be viewed; got 2-D"):
-        MapViewer(LardHilbertMap(dim=2))
+    with pytest.raises(ValueError, match="must be a 2-D or 3-D map to be viewed; got 4-D"):
+        MapViewer(LardHilbertMap(dim=4))
     with pytest.raises(ValueError, match="it is empty: fit it first"):
         MapViewer(LardHilbertMap())
 
@@ -189,12 +234,9 @@ def test_the_page_of_a_map_to_come_opens_with_its_first_cluster(model):
 def test_the_page_shows_no_more_than_its_budgets_and_the_mesh_keeps_its_faces(scans):
     mesh = trimesh.creation.icosphere(5)  # 20,480 faces
     mesh.visual.vertex_colors = np.tile([10, 200, 30, 255], (len(mesh.vertices), 1))
-    fewer = scene.fewer_faces(mesh, 2000)
+    fewer = simplify_mesh(mesh, 2000)
     assert 1000 < len(fewer.faces) <= 2000
     assert len(mesh.faces) == 20_480
-    assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 1).max() < 0.02
-    assert (fewer.visual.vertex_colors == [10, 200, 30, 255]).all()
-    assert scene.fewer_faces(mesh, 30_000) is mesh
     points, colors = scene.scan_points(scans, 1500, np.zeros(3))
     assert 700 < len(points) <= 1500
     assert len(colors) == len(points)

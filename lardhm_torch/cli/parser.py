@@ -137,15 +137,42 @@ def _file_verbs(verb: Any) -> None:
     _output(sub, "mesh to write: .ply, .obj, .glb, .off or .stl")
     _resolution(sub, 0.05)
     _surface(sub)
+    sub.add_argument(
+        "--faces",
+        type=int,
+        metavar="N",
+        help="simplify the mesh to about N faces (default: do not)",
+    )
 
     sub = verb(queries.grid)
     sub.add_argument("map", metavar="MAP", help=MAP)
-    _output(sub, "grid to write: .npz, or .bt or .ot for OctoMap")
+    sub.add_argument(
+        "-o", "--output", metavar="FILE", help="grid to write: .npz, or .bt or .ot for OctoMap"
+    )
     _resolution(sub, 0.1)
     sub.add_argument(
         "--distance",
         action="store_true",
         help="write signed distances to the nearest surface [m]; only .npz",
+    )
+    sub.add_argument(
+        "--sparse", action="store_true", help="with .npz: only blocks of cells near clusters"
+    )
+    sub.add_argument(
+        "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
+    )
+    sub.add_argument(
+        "--heights",
+        nargs=2,
+        type=finite,
+        metavar=("LOW", "HIGH"),
+        help="with --nav2: z of the lowest and highest obstacles of a 3-D map [m], above the floor",
+    )
+    sub.add_argument(
+        "--mode",
+        choices=("trinary", "scale"),
+        default="trinary",
+        help="with --nav2: three values, or probabilities of known cells (default: trinary)",
     )
 
 

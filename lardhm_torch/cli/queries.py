@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
-MAX_CELLS = 1 << 17  # along an axis of a grid or mesh: beyond it memory runs out
-
 
 def query(arguments: argparse.Namespace) -> None:
     """Compute the probability of occupancy at points."""
@@ -44,12 +42,17 @@ def query(arguments: argparse.Namespace) -> None:
 def mesh(arguments: argparse.Namespace) -> None:
     """Extract the surface of a map as a mesh."""
     from lardhm_torch.io.mesh_files import MESH_SUFFIXES, save_mesh
+    from lardhm_torch.surfaces.simplification import simplify_mesh
     from lardhm_torch.tiles.tiled_map import open_map
 
     check_output(arguments.output, MESH_SUFFIXES, [arguments.map])
     model = open_map(arguments.map)
-    _check_resolution(model, arguments.resolution)
+    _check_resolution(arguments.resolution)
+    if arguments.faces is not None and arguments.faces < 1:
+        raise ValueError(f"--faces must be at least 1; got {arguments.faces}")
     surface = _surface(model, arguments)
+    if arguments.faces is not None:
+        surface = simplify_mesh(surface, arguments.faces)
     save_mesh(surface, arguments.output)
     print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
 
@@ -57,15 +60,42 @@ def mesh(arguments: argparse.Namespace) -> None:
 def grid(arguments: argparse.Namespace) -> None:
     """Write the probabilities of a map, or distances to its surface, on a grid."""
     from lardhm_torch.io.grid_files import GRID_SUFFIXES, save_grid
+    from lardhm_torch.io.nav2_files import save_nav2
     from lardhm_torch.tiles.tiled_map import open_map
 
-    check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
-    if arguments.distance and Path(arguments.output).suffix.lower() != ".npz":
-        raise ValueError(f"--output must end in .npz with --distance; got {arguments.output}")
+    if arguments.output is None and arguments.nav2 is None:
+        raise ValueError("give --output or --nav2, or both")
+    if arguments.nav2 is None and arguments.heights is not None:
+        raise ValueError("--heights needs --nav2; a grid of --output has all heights")
+    for option in ("sparse", "distance"):
+        if getattr(arguments, option) and arguments.output is None:
+            raise ValueError(f"--{option} needs --output")
+    if arguments.output is not None:
+        check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
+        if arguments.distance and Path(arguments.output).suffix.lower() != ".npz":
+            raise ValueError(f"--output must end in .npz with --distance; got {arguments.output}")
+    if arguments.nav2 is not None:
+        check_output(arguments.nav2, (".yaml", ".yml"), [arguments.map], option="--nav2")
     model = open_map(arguments.map)
-    _check_resolution(model, arguments.resolution)
-    count = save_grid(model, arguments.output, arguments.resolution, distance=arguments.distance)
-    print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
+    _check_resolution(arguments.resolution)
+    if arguments.nav2 is not None:
+        columns, rows = save_nav2(
+            model,
+            arguments.nav2,
+            arguments.resolution,
+            heights=arguments.heights and tuple(arguments.heights),
+            mode=arguments.mode,
+        )
+        print(f"{columns} x {rows} cells of {arguments.resolution} m -> {arguments.nav2}")
+    if arguments.output is not None:
+        count = save_grid(
+            model,
+            arguments.output,
+            arguments.resolution,
+            distance=arguments.distance,
+            sparse=arguments.sparse,
+        )
+        print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 
 def view(arguments: argparse.Namespace) -> None:
@@ -81,7 +111,7 @@ def view(arguments: argparse.Namespace) -> None:
     _check_address(arguments.host, arguments.port)
     model = open_map(arguments.map)
     if arguments.resolution is not None:
-        _check_resolution(model, arguments.resolution)
+        _check_resolution(arguments.resolution)
     scans = read_scans(arguments, model.dim) if arguments.scans else None
     config = ViewConfig(host=arguments.host, port=arguments.port, resolution=arguments.resolution)
     viewer = MapViewer(model, scans, config)
@@ -119,7 +149,7 @@ def render(arguments: argparse.Namespace) -> None:
 
     check_output(arguments.output, (".png",), [arguments.map])
     model = open_map(arguments.map)
-    _check_resolution(model, arguments.resolution)
+    _check_resolution(arguments.resolution)
     if arguments.slice is not None or model.dim == 2:
         render_slice(model, arguments.output, arguments.slice, arguments.resolution)
         print(f"slice -> {arguments.output}")
@@ -177,21 +207,10 @@ def _surface(model: LardHilbertMap | TiledMap, arguments: argparse.Namespace) ->
     )
 
 
-def _check_resolution(model: LardHilbertMap | TiledMap, resolution: float) -> None:
-    """Raise a ValueError for a cell size that is not positive or would fill the memory."""
-    from lardhm_torch.queries.grids import map_bounds
-
+def _check_resolution(resolution: float) -> None:
+    """Raise a ValueError for a cell size that is not positive."""
     if not 0 < resolution < float("inf"):
         raise ValueError(f"--resolution must be > 0 m and finite; got {resolution}")
-    if len(model) == 0:
-        return
-    lower, upper = map_bounds(model)
-    extent = float((upper - lower).max())
-    if extent / resolution > MAX_CELLS:
-        raise ValueError(
-            f"--resolution must be at least {extent / MAX_CELLS:.2g} m for a map that spans "
-            f"{extent:.1f} m; got {resolution}"
-        )
 
 
 def _is_scans(name: str) -> bool:

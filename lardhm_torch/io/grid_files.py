@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,12 @@ from lardhm_torch.queries.grids import (
     map_bounds,
     query_grid,
 )
-from lardhm_torch.surfaces.meshing import BLOCK_CELLS, active_blocks
+from lardhm_torch.queries.memory import check_memory
+from lardhm_torch.surfaces.lattice import BLOCK_CELLS, Lattice, blocks_near_boxes
 
 GRID_SUFFIXES = (".bt", ".npz", ".ot")
+_COARSE_CELLS = 800  # along the longest axis, to estimate the size of a tree
+_TREE_BYTES = 8  # for each cell near a cluster: most are unknown or merged
 _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
 
 
@@ -37,6 +41,7 @@ def save_grid(
     bounds: tuple[TensorLike, TensorLike] | None = None,
     *,
     distance: bool = False,
+    sparse: bool = False,
 ) -> int:
     """Write the map as a grid of cells, in the format of the extension.
 
@@ -49,6 +54,11 @@ def save_grid(
     | ``.bt`` | OctoMap: occupied and free cells, the rest unknown |
     | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511), pruned |
 
+    A sparse ``.npz`` holds only blocks of 8 x 8 x 8 cells that a cluster's box of three standard
+    deviations touches: ``probability`` (B, 8, 8, 8) float32 and ``blocks`` (B, 3), the first cell of
+    each, counted from the one at ``lower``. All other cells are unknown. It is written block by block,
+    so memory does not grow with the map.
+
     An OctoMap cell has the highest log-odds of the centers of its eight parts, since surfaces are
     thinner than cells and OctoMap too lets occupied win. It is known where they are 1 or more away
     from 0 (probability 0.27, 0.73).
@@ -59,13 +69,15 @@ def save_grid(
         resolution: edge of a cell [m].
         bounds: lower and upper corner of the part to write, world frame [m]; None: all of it.
         distance: write signed distances to the nearest surface instead of probabilities.
+        sparse: write a sparse ``.npz``, of a 3-D map.
 
     Returns:
         The number of cells written.
 
     Raises:
         ValueError: the extension is another (of distances: not .npz), the map is empty or has the
-            wrong dimension, or it lies outside what an OctoMap of this resolution spans.
+            wrong dimension, the map lies outside what an OctoMap of this resolution spans, or the
+            grid would not fit in memory.
         ImportError: an OctoMap is asked for and octomap-python is not installed.
         FileNotFoundError: the folder of path does not exist.
     """
@@ -75,11 +87,20 @@ def save_grid(
         raise ValueError(f"path must end in one of {known} for a grid; got {Path(path).name!r}")
     if distance and suffix != ".npz":
         raise ValueError(f"path must end in .npz for a grid of distances; got {Path(path).name!r}")
+    if sparse and distance:
+        raise ValueError("distances cannot be sparse; give distance or sparse")
+    if sparse and (suffix != ".npz" or model.dim != 3):
+        raise ValueError(
+            f"sparse needs a path that ends in .npz and a 3-D map; got {Path(path).name!r} and "
+            f"{model.dim}-D. OctoMap trees are sparse anyway"
+        )
     lower, upper = map_bounds(model) if bounds is None else bounds
     lower, upper = (torch.as_tensor(end, dtype=torch.float64).cpu() for end in (lower, upper))
     grid_axes(lower, upper, resolution)  # raises for what is no resolution and no corners
     first, last = (lower / resolution).floor(), (upper / resolution).ceil() - 1
     first_center, last_center = ((end + 0.5) * resolution for end in (first, last.maximum(first)))
+    if sparse:
+        return _save_sparse(model, path, resolution, first_center, last_center)
     if suffix == ".npz":
         ask = _distance_grid if distance else query_grid
         values = ask(model, first_center, last_center, resolution)
@@ -112,6 +133,52 @@ def _distance_grid(model: OccupancyMap, first: Tensor, last: Tensor, resolution:
     )
 
 
+@torch.no_grad()
+def _save_sparse(
+    model: OccupancyMap,
+    path: str | os.PathLike[str],
+    resolution: float,
+    first: Tensor,
+    last: Tensor,
+) -> int:
+    """Write the cells of all blocks near clusters; returns how many."""
+    lattice, places = _blocks_of_cells(model, first, last, resolution)
+    axes = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
+    shape = (len(places), *[BLOCK_CELLS] * 3)
+    small = {
+        "blocks": places.numpy(),
+        "lower": (first - 0.5 * resolution).numpy(),
+        "resolution": np.float64(resolution),
+        "cells": lattice.cells,
+    }
+    with (
+        replaced_file(path) as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as file,
+    ):
+        for name, array in small.items():
+            with file.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, np.asanyarray(array))
+        with file.open("probability.npy", "w", force_zip64=True) as member:
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(member, header)
+            for some in places.split(BLOCK_POINTS // len(axes)):
+                points = first + resolution * (some[:, None] + axes).double()
+                probability = model(points.to(model.origin.device)).float().cpu().numpy()
+                member.write(probability.astype("<f4").tobytes())
+    return math.prod(shape)
+
+
+def _blocks_of_cells(
+    model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
+) -> tuple[Lattice, Tensor]:
+    """Cells between two centers as a lattice, and the first cells (B, 3) of blocks near clusters."""
+    cells = ((last - first) / resolution).round().long() + 1
+    corner = (first / resolution - 0.5).round().long()
+    lattice = Lattice(corner.numpy(), cells.numpy(), resolution)
+    near = blocks_near_boxes(lattice, *cluster_boxes(model))
+    return lattice, torch.from_numpy(lattice.place(near))
+
+
 def _octomap_of(
     model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
 ) -> tuple[Any, int]:
@@ -125,12 +192,26 @@ def _octomap_of(
             f"side of zero; the map reaches {reach:.0f} m. Use a larger resolution, or subtract "
             "model.origin from the scans"
         )
+    _check_tree_memory(model, first, last, resolution)
     tree, count = new_tree(resolution), 0
     for centers, log_odds in _known_cells(model, first, last, resolution):
         for center, value in zip(to_array(centers), log_odds.tolist(), strict=True):
-            tree.updateNode(center, value)  # prunes; a lazy update does not
+            tree.updateNode(center, value, False)  # not lazy: equal cells are pruned
         count += len(centers)
     return tree, count
+
+
+def _check_tree_memory(model: OccupancyMap, first: Tensor, last: Tensor, resolution: float) -> None:
+    """Raise a ValueError if the known cells would not fit in memory, by the volume near clusters."""
+    coarse = float((last - first).max()) / _COARSE_CELLS + resolution
+    corner = (first / coarse).floor().long()
+    cells = (last / coarse).floor().long() - corner + 1
+    lattice = Lattice(corner.numpy(), cells.numpy(), coarse)
+    blocks = blocks_near_boxes(lattice, *cluster_boxes(model))
+    volume = float(lattice.marched_cells(blocks).prod(axis=1).sum()) * coarse**3
+    count = volume / resolution**3
+    what = f"the tree would have up to {count / 1e6:.3g} million cells"
+    check_memory(what, resolution, _TREE_BYTES * count, power=3)
 
 
 @torch.no_grad()
@@ -138,15 +219,12 @@ def _known_cells(
     model: OccupancyMap, first: Tensor, last: Tensor, resolution: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Centers (n, 3) and log-odds (n,) of the known cells, some blocks that hold clusters a time."""
-    lower, upper = (box.cpu() for box in cluster_boxes(model))
-    cells = ((last - first) / resolution).round().long() + 1
-    corner = first - 0.5 * resolution
-    touching = ((upper >= corner) & (lower <= last + 0.5 * resolution)).all(dim=1)
-    lower, upper = (((box[touching] - corner) / resolution).clamp(min=0) for box in (lower, upper))
+    lattice, places = _blocks_of_cells(model, first, last, resolution)
+    cells = torch.from_numpy(lattice.cells)
     local = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
     parts = (torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 3) * resolution).double()
-    for blocks in active_blocks(lower, upper, cells).split(BLOCK_POINTS // (8 * len(local))):
-        index = (blocks[:, None] * BLOCK_CELLS + local).reshape(-1, 3)
+    for some in places.split(BLOCK_POINTS // (8 * len(local))):
+        index = (some[:, None] + local).reshape(-1, 3)
         centers = first + resolution * index[(index < cells).all(dim=1)].double()
         points = (centers[:, None] + parts).to(model.origin.device)
         log_odds = model.log_odds(points).float().amax(dim=1).cpu()

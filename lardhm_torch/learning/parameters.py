@@ -126,6 +126,16 @@ class MapParameters(nn.Module):
         yield from self.named_parameters(recurse=False)
         yield from self.named_buffers(recurse=False)
 
+    def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
+        """Parameter groups for an optimizer, with weight decay on the weights only.
+
+        Weight decay would pull centers to the map's origin and length-scales to 1 m.
+        """
+        return [
+            {"params": [self.weights], "weight_decay": weight_decay},
+            {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
+        ]
+
     def extra_repr(self) -> str:
         """Number of clusters and settings, for `print(model)`."""
         settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lardhm_torch import features
 from lardhm_torch.features import Kernel
+from lardhm_torch.native import surfaces
 from lardhm_torch.native.build import available as library_available
 
 DIMENSIONS = (2, 3)
@@ -301,6 +302,7 @@ def _register() -> None:
     def _(counts: Tensor, means: Tensor, scatters: Tensor, raw: Tensor, *_: Any) -> Any:
         return tuple(torch.empty_like(t) for t in (counts, means, scatters, means, raw))
 
+    surfaces.register()
     library.register_autograd("lardhm::occupancy", _backward, setup_context=_keep_inputs)
 
 

@@ -33,7 +33,7 @@ FLAGS = (
 # last two do without.
 UNITS = (
     ("query", "kmeans", "gradients", "descent"),
-    ("raycast", "update", "pooling", "evidence", "cells", "threads"),
+    ("raycast", "update", "pooling", "evidence", "cells", "marching", "ridge", "threads"),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
 )

@@ -14,6 +14,8 @@
 namespace lardhm {
 namespace {
 
+constexpr int64_t kMostInCube = 1024;  // points, as many as a region of the search holds
+
 // Neighbors of each point, ascending by row of the centers, and optionally their kernel values. If
 // another order of the points is given, they are written in that order and are not sorted: sums over
 // all neighbors do not need it.
@@ -271,6 +273,48 @@ Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderO
   return values;
 }
 
+// Log-odds at the points of cubes of a lattice, (B, edge, ...) for (B, D) first points.
+Tensor cube_log_odds(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyArrayRef shape,
+                     const Tensor& given_firsts, int64_t edge, const Tensor& centers,
+                     const Tensor& raw, const Tensor& weights, int64_t k, double covariance_scale,
+                     double min_lengthscale, const Tensor& index) {
+  check_k(k);
+  const Tensor axes = tidy(given_axes), firsts = tidy(given_firsts);
+  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  const int64_t dim = centers.size(1), cubes = firsts.size(0);
+  int64_t coordinates = 0, points = 1;
+  for (int64_t n : shape) coordinates += n;
+  for (int64_t d = 0; d < dim; ++d) points *= edge;
+  check(int64_t(shape.size()) == dim && axes.numel() == coordinates &&
+            axes.scalar_type() == centers.scalar_type(),
+        "axes must hold one list of coordinates for each dimension of the map, of its dtype");
+  check(edge >= 1 && edge <= 32 && points <= kMostInCube,
+        "a cube must have 1 to 1024 points");
+  check(firsts.dim() == 2 && firsts.size(1) == dim && firsts.scalar_type() == ScalarType::Long,
+        "firsts must be (B, D) int64");
+  for (int64_t i = 0; i < cubes * dim; ++i)
+    check(in<int64_t>(firsts)[i] >= 0 && in<int64_t>(firsts)[i] + edge <= shape[i % dim],
+          "cubes must lie in the lattice");
+  std::vector<int64_t> sizes(1, cubes);
+  sizes.insert(sizes.end(), dim, edge);
+  k = std::min(k, centers.size(0));
+  const Tensor values = torch::stable::new_zeros(
+      axes, torch::headeronly::IntHeaderOnlyArrayRef(sizes.data(), sizes.size()));
+  if (cubes == 0 || k == 0) return values;
+  dispatch(centers, [&](auto type, auto dimension) {
+    using T = decltype(type);
+    constexpr int D = dimension();
+    const T* axis[D];
+    for (int d = 0; d < D; ++d) axis[d] = d ? axis[d - 1] + shape[d - 1] : in<T>(axes);
+    with_parameters<T, D>(map, cubes * points, [&](Parameters<T, D>& parameters) {
+      OccupancyVisitor<T, D> visitor(parameters, false, out<T>(values));
+      visit_cubes<T, D>(axis, in<int64_t>(firsts), cubes, edge, parameters, k, visitor);
+    });
+    return 0;
+  });
+  return values;
+}
+
 }  // namespace
 }  // namespace lardhm
 
@@ -291,6 +335,10 @@ STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
       "lattice_occupancy(Tensor axes, int[] shape, Tensor centers, Tensor raw_scale_tril, "
       "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
       "bool probability) -> Tensor");
+  m.def(
+      "cube_log_odds(Tensor axes, int[] shape, Tensor firsts, int edge, Tensor centers, "
+      "Tensor raw_scale_tril, Tensor weights, int k, float covariance_scale, "
+      "float min_lengthscale, Tensor index) -> Tensor");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
@@ -301,4 +349,5 @@ STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
   m.impl("ordered_features", TORCH_BOX(&lardhm::ordered_features));
   m.impl("occupancy", TORCH_BOX(&lardhm::occupancy));
   m.impl("lattice_occupancy", TORCH_BOX(&lardhm::lattice_occupancy));
+  m.impl("cube_log_odds", TORCH_BOX(&lardhm::cube_log_odds));
 }

@@ -107,12 +107,12 @@ struct Lattice {
   }
 };
 
-// Steps from the corner of a brick along each axis, along a Z curve.
+// Steps from the corner of a cube along each axis, along a Z curve; an edge has a power of 2 points.
 template <int D>
-std::vector<std::array<int8_t, D>> brick_order() {
+std::vector<std::array<int8_t, D>> brick_order(int edge) {
   std::vector<std::array<int8_t, D>> order;
   int count = 1;
-  for (int d = 0; d < D; ++d) count *= kBrick<D>;
+  for (int d = 0; d < D; ++d) count *= edge;
   for (int code = 0; code < count; ++code) {
     std::array<int8_t, D> step{};
     for (int bit = 0; (1 << bit) < count; ++bit)
@@ -149,7 +149,7 @@ void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>&
                    int64_t k, Visitor<T, D>& visitor) {
   const Lattice<D> lattice(shape);
   const Engine<T, D> engine(nullptr, parameters, k);
-  const auto order = brick_order<D>();
+  const auto order = brick_order<D>(kBrick<D>);
   const int64_t threads = parameters.packed.empty() ? num_threads() : 1;
   std::atomic<int64_t> next{0};
   run_tasks(std::min(lattice.tasks, threads), [&](int64_t) {
@@ -164,6 +164,38 @@ void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>&
         const int64_t n = fill_brick<T, D>(axes, lattice, first, edge, order, scratch);
         engine.visit_filled(lattice.row(first), n, lattice.total, scratch, visitor);
       }
+  });
+}
+
+template <class T, int D>
+void visit_cubes(const T* const* axes, const int64_t* firsts, int64_t cubes, int64_t edge,
+                 Parameters<T, D>& parameters, int64_t k, Visitor<T, D>& visitor) {
+  const Engine<T, D> engine(nullptr, parameters, k);
+  int wide = 1;
+  while (wide < edge) wide *= 2;
+  auto order = brick_order<D>(wide);
+  const auto outside = [edge](const auto& step) {
+    return *std::max_element(step.begin(), step.end()) >= edge;
+  };
+  order.erase(std::remove_if(order.begin(), order.end(), outside), order.end());
+  const int64_t points = int64_t(order.size());
+  const int64_t threads = parameters.packed.empty() ? num_threads() : 1;
+  std::atomic<int64_t> next{0};
+  run_tasks(std::min(cubes, threads), [&](int64_t) {
+    Scratch<T, D> scratch;
+    scratch.make_room();
+    for (int64_t cube = next++; cube < cubes; cube = next++) {
+      const int64_t* first = firsts + cube * D;
+      for (int64_t i = 0; i < points; ++i) {
+        int64_t row = 0;
+        for (int d = 0; d < D; ++d) {
+          scratch.x[d][i] = axes[d][first[d] + order[i][d]];
+          row = row * edge + order[i][d];
+        }
+        scratch.order[i] = int32_t(row);
+      }
+      engine.visit_filled(cube * points, points, cubes * points, scratch, visitor);
+    }
   });
 }
 
@@ -187,6 +219,8 @@ void Search<T, D>::visit(const T* points, const T* slack, int64_t n, Visitor<T, 
                                   const std::vector<Visitor<T, D>*>&);                             \
   template void visit_lattice<T, D>(const T* const*, const int64_t*, Parameters<T, D>&, int64_t,   \
                                     Visitor<T, D>&);                                               \
+  template void visit_cubes<T, D>(const T* const*, const int64_t*, int64_t, int64_t,               \
+                                  Parameters<T, D>&, int64_t, Visitor<T, D>&);                     \
   template class Search<T, D>;
 LARDHM_INSTANTIATE(float, 2)
 LARDHM_INSTANTIATE(float, 3)

@@ -43,6 +43,12 @@ template <class T, int D>
 void visit_lattice(const T* const* axes, const int64_t* shape, Parameters<T, D>& parameters,
                    int64_t k, Visitor<T, D>& visitor);
 
+// Shows the points of cubes of a lattice with `edge` points along each axis, the first ones at
+// `firsts` (blocks, D); row edge^D b + ... + e is point (..., e) of cube b.
+template <class T, int D>
+void visit_cubes(const T* const* axes, const int64_t* firsts, int64_t cubes, int64_t edge,
+                 Parameters<T, D>& parameters, int64_t k, Visitor<T, D>& visitor);
+
 template <class T, int D>
 struct Scratch;
 

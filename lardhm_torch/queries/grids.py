@@ -16,7 +16,8 @@ from lardhm_torch.maps import (
     pieces,
     to_tensor,
 )
-from lardhm_torch.native import nearest_centers
+from lardhm_torch.native import build_index, nearest_centers
+from lardhm_torch.queries.memory import check_memory
 
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # half edge of a cluster's box; a kernel is exp(-3^2 / 2) = 1 % of its peak there
@@ -99,10 +100,12 @@ def grid_axes(
         raise ValueError(
             f"lower and upper must be finite; got {lower.tolist()} and {upper.tolist()}"
         )
-    counts = ((upper - lower) / resolution + 1e-6).floor().long() + 1  # 1e-6: 0.3 / 0.1 is 2.99...
+    counts = ((upper - lower) / resolution + 1e-6).floor() + 1  # 1e-6: 0.3 / 0.1 is 2.99...
+    length = float(counts.sum())
+    check_memory(f"an axis would have {length:.3g} points", resolution, 8 * length, power=1)
     return [
-        start + resolution * torch.arange(int(count), dtype=torch.float64, device=lower.device)
-        for start, count in zip(lower, counts, strict=True)
+        start + resolution * torch.arange(count, dtype=torch.float64, device=lower.device)
+        for start, count in zip(lower, counts.long().tolist(), strict=True)
     ]
 
 
@@ -121,11 +124,17 @@ def query_grid(
         (n1, ..., nD) in the dtype and on the device of the map, without gradient.
 
     Raises:
-        ValueError: as for `grid`; or the corners do not have the dimension of the map.
+        ValueError: as for `grid`; the corners do not have the dimension of the map; or the grid would
+            not fit in memory.
     """
     axes = grid_axes(lower, upper, resolution, model.origin.device)
     if len(axes) != model.dim:
         raise ValueError(f"lower and upper must have {model.dim} coordinates; got {len(axes)}")
+    points = math.prod(len(axis) for axis in axes)
+    needed = 2 * model.centers.element_size() * points
+    check_memory(
+        f"the grid would have {points / 1e6:.3g} million points", resolution, needed, len(axes)
+    )
     return lattice_values(model, axes, probability=True)
 
 
@@ -230,20 +239,37 @@ def cluster_boxes(model: OccupancyMap, sign: int = 0) -> tuple[Tensor, Tensor]:
     return torch.cat([lower for lower, _ in boxes]), torch.cat([upper for _, upper in boxes])
 
 
+class SupportingClusters:
+    """The clusters of a map whose weights have one sign, for `Support` at many points.
+
+    Args:
+        model: a map that fits in memory.
+        sign: 1 or -1, of the weights.
+    """
+
+    def __init__(self, model: OccupancyMap, sign: int) -> None:
+        chosen = (model.weights.detach() * sign > 0).nonzero().squeeze(1)
+        self.origin = model.origin
+        self.centers = model.centers.detach()[chosen]
+        self.stds = torch.linalg.svdvals(model.scale_tril.detach()[chosen].double())[:, -1]
+        self.index = build_index(self.centers, 1)
+
+    def nearest(self, points: Tensor) -> Support:
+        """Nearest of the clusters, for (N, D) float64 world positions [m]."""
+        if len(self.centers) == 0:
+            return Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
+        local = (points - self.origin).to(self.centers.dtype)
+        nearest = nearest_centers(local, self.centers, 1, self.index).squeeze(1)
+        return Support(self.centers[nearest].double() + self.origin, self.stds[nearest])
+
+
 @torch.no_grad()
 def nearest_support(model: OccupancyMap, points: Tensor, sign: int) -> Support:
     """The nearest cluster whose weight has this sign, for (N, D) float64 world positions [m]."""
     support = Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
     for rows, part in local_parts(model, points, points):
-        chosen = (part.weights * sign > 0).nonzero().squeeze(1)
-        if len(chosen) == 0:
-            continue
-        centers = part.centers.detach()[chosen]
-        local = (points[rows] - part.origin).to(centers.dtype)
-        nearest = nearest_centers(local, centers, 1).squeeze(1)
-        stds = torch.linalg.svdvals(part.scale_tril.detach()[chosen].double())
-        support.centers[rows] = centers[nearest].double() + part.origin
-        support.thickness[rows] = stds[nearest, -1]
+        found = SupportingClusters(part, sign).nearest(points[rows])
+        support.centers[rows], support.thickness[rows] = found
     return support
 
 

@@ -1,4 +1,4 @@
-"""Move a mesh from a level set of the log-odds to the ridge behind it, where the hits lie.
+"""Move a surface from a level set of the log-odds to the ridge behind it, where the hits lie.
 
 Free space is learned only up to some centimeters before each hit, so the level set at probability
 1/2 lies in front of the hits. Across a surface, the log-odds are largest at the hits themselves.
@@ -6,55 +6,20 @@ Free space is learned only up to some centimeters before each hit, so the level 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap
-from lardhm_torch.queries.grids import nearest_support
+from lardhm_torch.maps import OccupancyMap, native_map
+from lardhm_torch.native import available
+from lardhm_torch.native import surfaces as native
+from lardhm_torch.queries.grids import EVIDENCE
 from lardhm_torch.queries.raycasting import first_peak, parabola_vertex
-
-if TYPE_CHECKING:
-    import trimesh
+from lardhm_torch.surfaces.following import Sheet
 
 MAX_DEPTH = 4.0  # standard deviations behind a vertex within which its ridge is sought
 STEPS = 16  # into which this depth is divided
-CHUNK_VERTICES = 1 << 18  # vertices evaluated at a time
-
-
-@torch.no_grad()
-def mesh_on_ridge(model: OccupancyMap, mesh: trimesh.Trimesh, resolution: float) -> trimesh.Trimesh:
-    """Move the vertices of a level-set mesh against their normals to the ridge of the log-odds.
-
-    The ridge is sought within four standard deviations of the nearest occupied cluster (its
-    smallest). Each vertex moves by the mean of its own depth and those of its neighbors. A face is
-    removed if a corner and its neighbors have no ridge, or if the depths of its corners differ by
-    more than a cell: they belong to different surfaces.
-
-    Args:
-        model: the map.
-        mesh: level set of its probability, normals into free space.
-        resolution: edge of the cells that the mesh was made with [m].
-
-    Returns:
-        A new mesh without colors.
-    """
-    import trimesh
-
-    device = model.origin.device
-    vertices = torch.as_tensor(np.array(mesh.vertices), device=device)
-    normals = torch.as_tensor(np.array(mesh.vertex_normals), device=device)
-    faces = torch.as_tensor(np.array(mesh.faces), device=device)
-    thickness = nearest_support(model, vertices, sign=1).thickness
-    depths = mean_with_neighbors(ridge_depths(model, vertices, normals, thickness), faces)
-    corners = depths[faces]
-    kept = corners.amax(dim=1) - corners.amin(dim=1) <= resolution  # False if one is NaN
-    moved = vertices - depths.nan_to_num()[:, None] * normals
-    result = trimesh.Trimesh(moved.cpu().numpy(), faces[kept].cpu().numpy(), process=False)
-    result.remove_unreferenced_vertices()
-    return result
+CHUNK_VERTICES = 1 << 15  # vertices evaluated at a time
 
 
 @torch.no_grad()
@@ -73,16 +38,24 @@ def ridge_depths(
         (V,) depths against the normals [m]; NaN if the peak is at either end of the `MAX_DEPTH`
         standard deviations searched.
     """
-    numbers = torch.arange(STEPS + 1, device=vertices.device)[:, None, None]
-    strides = thickness * (MAX_DEPTH / STEPS)
-    depths = []
-    for start, step in zip(
-        vertices.split(CHUNK_VERTICES),
-        (normals * strides[:, None]).split(CHUNK_VERTICES),
-        strict=True,
-    ):
-        depths.append(_peak_position(model.log_odds(start - numbers * step).double().T))
-    return torch.cat(depths) * strides
+    strides = thickness.double() * (MAX_DEPTH / STEPS)
+    return strides * ridge_positions(model, vertices, normals * strides[:, None])
+
+
+def ridge_positions(model: OccupancyMap, points: Tensor, strides: Tensor) -> Tensor:
+    """(V, D) points [m] and strides [m] -> (V,) strides back to the first peak of the log-odds.
+
+    NaN if the peak is at either end of the `STEPS` strides.
+    """
+    tensors = native_map(model)
+    if tensors is not None:
+        return native.ridge_positions(tensors, points, strides, STEPS, EVIDENCE)
+    numbers = torch.arange(STEPS + 1, device=points.device)[:, None, None]
+    chunks = zip(points.split(CHUNK_VERTICES), strides.split(CHUNK_VERTICES), strict=True)
+    positions = [
+        _peak_position(model.log_odds(start - numbers * step).double().T) for start, step in chunks
+    ]
+    return torch.cat([points.new_zeros(0), *positions])
 
 
 def _peak_position(log_odds: Tensor) -> Tensor:
@@ -97,26 +70,67 @@ def _peak_position(log_odds: Tensor) -> Tensor:
     return torch.where((peak > 0) & (peak < last), position, torch.nan)
 
 
-def mean_with_neighbors(values: Tensor, faces: Tensor) -> Tensor:
-    """Mean of each vertex's value and those of its neighbors; NaN values are ignored.
+def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Sheet:
+    """Move the vertices of a surface against their normals to the ridge of the log-odds.
+
+    The ridge is sought within four standard deviations of the nearest occupied cluster (its
+    smallest). Normals are averaged over neighbors first. Each vertex moves by the mean of its own
+    depth and those of its neighbors. A face is removed if a corner and its neighbors have no ridge,
+    or if the depths of its corners differ by more than a cell: they belong to different surfaces.
+    A face that turned over on the way is removed, too.
 
     Args:
-        values: (V,).
+        model: the map.
+        sheet: part of a level set of its log-odds.
+        resolution: edge of the cells that the surface was made with [m].
+    """
+    vertices, faces, normals, thickness = sheet
+    normals = mean_with_neighbors(normals, faces)
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    columns = (torch.from_numpy(c).to(model.origin.device) for c in (vertices, normals, thickness))
+    depths = ridge_depths(model, *columns).cpu().numpy()
+    depths = mean_with_neighbors(depths[:, None], faces)
+    moved = vertices - np.nan_to_num(depths) * normals
+    corners = depths[:, 0][faces]
+    kept = corners.max(axis=1) - corners.min(axis=1) <= resolution  # a NaN compares as False
+    kept[kept] = ~_turned_over(moved, faces[kept], normals)
+    return Sheet(moved, faces[kept], normals, thickness)
+
+
+def _turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(F,) whether a face looks against the normals of its vertices."""
+    a, b, c = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
+    first, second = (b - a).astype(np.float32), (c - a).astype(np.float32)
+    looks = sum(normals.take(faces[:, corner], axis=0) for corner in range(3))
+    across = torch.linalg.cross(torch.from_numpy(first), torch.from_numpy(second)).numpy()
+    return np.einsum("ij,ij->i", across, looks) <= 0
+
+
+def mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Mean of each vertex's value and those at the other corners of its faces, face by face.
+
+    Args:
+        values: (V, C), rows with NaN are ignored.
         faces: (F, 3) vertices of each face.
 
     Returns:
-        (V,), NaN where neither the vertex nor any neighbor has a value.
+        (V, C), NaN where neither the vertex nor any neighbor has a value.
     """
-    known = ~values.isnan()
-    sums, counts = torch.where(known, values, 0.0), known.to(values.dtype)
-    first, second = _edges(faces)
-    ends, others = torch.cat([first, second]), torch.cat([second, first])
-    return sums.index_add(0, ends, sums[others]) / counts.index_add(0, ends, counts[others])
+    if not available():
+        return plain_mean_with_neighbors(values, faces)
+    arrays = (torch.from_numpy(a) for a in (values.astype(np.float64), faces.astype(np.int64)))
+    return native.mean_with_neighbors(*arrays).numpy()
 
 
-def _edges(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends of each edge, each edge once."""
-    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=1).values
-    low, high = pairs.unbind(dim=1)
-    keys = (low * (int(faces.max()) + 1) + high).unique()  # much faster than unique rows
-    return keys // (int(faces.max()) + 1), keys % (int(faces.max()) + 1)
+def plain_mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """`mean_with_neighbors` in NumPy."""
+    known = (~np.isnan(values).any(axis=1)).astype(np.float64)
+    columns = np.column_stack([known, np.where(known[:, None] > 0, values, 0.0)]).T
+    sums = columns.copy()
+    for corner in range(3):
+        first, second = faces[:, corner - 1], faces[:, corner - 2]
+        for total, own in zip(sums, columns, strict=True):
+            weights = own[first] + own[second]
+            total += np.bincount(faces[:, corner], weights, minlength=len(values))
+    with np.errstate(invalid="ignore"):
+        return (sums[1:] / sums[0]).T

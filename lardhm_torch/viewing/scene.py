@@ -14,6 +14,8 @@ from torch import Tensor
 from lardhm_torch.maps import OccupancyMap, covariance_scale
 from lardhm_torch.queries.grids import query_slice
 from lardhm_torch.scans import Scans
+from lardhm_torch.surfaces.estimate import estimate_mesh
+from lardhm_torch.surfaces.simplification import simplify_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,41 +31,49 @@ KEY_LIGHT = np.array([0.35, -0.45, 0.82])  # direction to the light baked into t
 
 
 def core_box(model: OccupancyMap) -> tuple[Tensor, Tensor]:
-    """Lower and upper corner (3,) of the box to show, world frame [m].
+    """Lower and upper corner (3,) of the box to show, world frame [m]. A flat map is at height 0.
 
     From the 2 % to the 98 % quantile of the centers of the occupied clusters, plus 0.5 m.
     """
     occupied = model.weights > 0
     centers = model.centers[occupied if bool(occupied.any()) else ...].detach().double().cpu()
     ends = torch.quantile(centers, torch.tensor([0.02, 0.98], dtype=torch.float64), dim=0)
-    return ends[0] + model.origin.cpu() - 0.5, ends[1] + model.origin.cpu() + 0.5
+    lower, upper = ends[0] + model.origin.cpu() - 0.5, ends[1] + model.origin.cpu() + 0.5
+    return (lower, upper) if model.dim == 3 else (in_space(lower), in_space(upper))
+
+
+def in_space(positions: Tensor) -> Tensor:
+    """(..., 2) or (..., 3) positions -> (..., 3), flat ones at height 0."""
+    return torch.nn.functional.pad(positions, (0, 3 - positions.shape[-1]))
 
 
 def view_resolution(model: OccupancyMap) -> float:
     """Edge of a cell [m] for a surface of about `MESH_FACES` faces.
 
-    The area of the surface is estimated from the occupied clusters, each covering two standard
-    deviations to either side. Thin clusters (first quartile) make cells smaller, down to about
-    `MAX_MESH_FACES` faces, because a surface much thinner than a cell has holes.
+    Thin clusters (first quartile) make cells smaller, down to about `MAX_MESH_FACES` faces, because a
+    surface much thinner than a cell has holes.
     """
     factors = model.scale_tril.detach()[model.weights > 0].double()
     if len(factors) == 0:
         return 0.1
-    axes = torch.linalg.svdvals(factors)  # standard deviations, largest first
-    area = 8 / covariance_scale(model) * float((axes[:, 0] * axes[:, 1]).sum())
-    wide, fine = ((4 * area / faces) ** 0.5 for faces in (MESH_FACES, MAX_MESH_FACES))
-    thin = float(axes[:, -1].quantile(0.25))
+    faces = estimate_mesh(model, 1.0).faces
+    wide, fine = ((faces / limit) ** 0.5 for limit in (MESH_FACES, MAX_MESH_FACES))
+    thin = float(torch.linalg.svdvals(factors)[:, -1].quantile(0.25))
     return max(0.02, fine, min(wide, SHEET_CELLS * thin))
 
 
 def slice_picture(
     model: OccupancyMap, height: float, core: tuple[Tensor, Tensor], offset: np.ndarray
 ) -> dict[str, Any]:
-    """Slice of the probability at a height above the offset [m], as arguments of `add_image`."""
+    """Slice of the probability at a height above the offset [m], as arguments of `add_image`.
+
+    Of a flat map, all of it.
+    """
     from matplotlib import colormaps
 
     pixel = float((core[1] - core[0])[:2].max()) / SLICE_PIXELS
-    probability, extent = query_slice(model, height + float(offset[2]), pixel, core)
+    level = height + float(offset[2]) if model.dim == 3 else None
+    probability, extent = query_slice(model, level, pixel, core)
     p = probability.float().cpu().numpy().T[::-1]  # first row at the largest y
     image = colormaps["RdBu_r"](p, bytes=True)
     image[..., 3] = np.clip(np.abs(p - 0.5) * 1000, 40, 235)  # unknown is nearly transparent
@@ -94,27 +104,6 @@ def ellipsoids(model: OccupancyMap, chosen: Tensor, offset: np.ndarray) -> dict[
         "batched_positions": (centers.numpy() - offset).astype(np.float32),
         "batched_scales": (stds / covariance_scale(model) ** 0.5).numpy().astype(np.float32),
     }
-
-
-def fewer_faces(mesh: trimesh.Trimesh, limit: int = SHOWN_FACES) -> trimesh.Trimesh:
-    """Simplify a mesh to about ``limit`` faces; vertices get the color of the nearest old vertex.
-
-    Source: Garland & Heckbert 1997, quadric error metrics (by fast-simplification).
-    """
-    import trimesh
-    from scipy.spatial import cKDTree
-
-    if len(mesh.faces) <= limit:
-        return mesh
-    import fast_simplification
-
-    vertices, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float32), mesh.faces, target_count=limit
-    )
-    nearest = cKDTree(mesh.vertices).query(vertices)[1]
-    visual: Any = mesh.visual
-    colors = visual.vertex_colors[nearest]
-    return trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
 
 
 def painted_glb(mesh: trimesh.Trimesh) -> bytes:
@@ -148,7 +137,7 @@ def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarra
     from matplotlib import colormaps
 
     hits = scans.hits
-    hits = hits[hits.isfinite().all(dim=1)].cpu()
+    hits = in_space(hits[hits.isfinite().all(dim=1)].cpu())
     points = thinned((hits.numpy() - offset).astype(np.float32), limit)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
@@ -219,7 +208,7 @@ class Stage:
             return 0
         moved = mesh.copy()
         moved.apply_translation(-self.offset)
-        shown = fewer_faces(moved)
+        shown = simplify_mesh(moved, SHOWN_FACES)
         scene.add_glb(
             "/surface",
             painted_glb(shown),
@@ -267,7 +256,7 @@ class Stage:
         points, colors = scan_points(scans, limit, self.offset)
         scene = self.server.scene
         scene.add_point_cloud("/scans", points, colors, point_size=0.02, precision="float32")
-        origins = (scans.origins.cpu().numpy() - self.offset).astype(np.float32)
+        origins = (in_space(scans.origins.cpu()).numpy() - self.offset).astype(np.float32)
         scene.add_point_cloud(
             "/sensors", origins, (255, 150, 0), point_size=0.12, point_shape="circle"
         )
@@ -278,10 +267,11 @@ class Stage:
         self.server.scene.get_handle_by_name("/scans").point_size = size
 
     def aim(self, core: tuple[Tensor, Tensor]) -> None:
-        """Place the camera obliquely above the box, far enough to see all of it."""
+        """Place the camera so far that it sees the whole box: obliquely above, or above a flat one."""
         low, high = (end.numpy() - self.offset for end in core)
         distance = max(float(np.linalg.norm(high - low)), 1.0)
+        direction = np.array([0.25, -0.5, 0.5] if high[2] > low[2] else [0.0, -0.01, 0.8])
         camera = self.server.initial_camera
         camera.look_at = tuple((low + high) / 2)
-        camera.position = tuple((low + high) / 2 + distance * np.array([0.25, -0.5, 0.5]))
+        camera.position = tuple((low + high) / 2 + distance * direction)
         self.server.scene.set_up_direction("+z")

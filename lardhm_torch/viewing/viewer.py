@@ -17,10 +17,13 @@ import numpy as np
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.maps import OccupancyMap, snapshot
 from lardhm_torch.scans import Scans
-from lardhm_torch.surfaces.meshing import SurfaceLattice, lattice_mesh, surface_lattice
+from lardhm_torch.surfaces.lattice import Lattice
+from lardhm_torch.surfaces.meshing import lattice_mesh, surface_lattice
 from lardhm_torch.surfaces.vertex_colors import COLORS, has_variance
 from lardhm_torch.viewing.scene import Stage, core_box, view_resolution
 
+CLOSING = 1.0  # [s] at most that `close` waits for what is being drawn
+DRAFT = 2.0  # cells of the first surface after a change over those of the final one
 EXPORT_SUFFIXES = (".html", ".viser")
 THRESHOLD_HINT = (
     "The surface stays on the hits. A higher threshold removes parts of which the map is less certain "
@@ -55,13 +58,13 @@ class MapViewer:
     """Serve a page that shows a map. Surfaces are extracted in a background thread.
 
     Args:
-        model: a 3-D map with clusters; later changes are shown by `update`.
+        model: a map of 2 or 3 dimensions with clusters; later changes are shown by `update`.
         scans: also shown, as points and sensor positions.
         config: address and resolution.
 
     Raises:
         ImportError: viser is not installed.
-        ValueError: the map is not 3-D or is empty.
+        ValueError: the map has another dimension or is empty.
     """
 
     def __init__(
@@ -73,7 +76,7 @@ class MapViewer:
         self._core = core_box(self._model)
         self.offset = ((self._core[0] + self._core[1]) / 2).round().numpy()
         self._stage = Stage(self.server, self.offset)
-        self._lattice: SurfaceLattice | None = None
+        self._lattices: list[Lattice | None] = []
         self._report = ""
         self._jobs: set[str] = {"map"}
         self._changed = threading.Condition()
@@ -96,9 +99,9 @@ class MapViewer:
         Returns immediately. Updates that arrive faster than they can be drawn are skipped.
 
         Raises:
-            ValueError: the map is not 3-D or is empty.
+            ValueError: the map has another dimension than the first one, or is empty.
         """
-        current = _checked_snapshot(model)
+        current = _checked_snapshot(model, (self._model.dim,))
         with self._changed:
             self._model = current
         self._request("map")
@@ -126,11 +129,11 @@ class MapViewer:
             partial.write_bytes(content)
 
     def close(self) -> None:
-        """Stop the thread and the server."""
+        """Stop the thread and the server; what is being drawn is given up."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._worker.join()
+        self._worker.join(CLOSING)
         self.server.stop()
 
     # --- controls ---
@@ -138,12 +141,30 @@ class MapViewer:
     def _add_controls(self) -> None:
         gui = self.server.gui
         self._status = gui.add_markdown("starting ...")
+        if self._model.dim == 2:
+            self._show_slice = gui.add_checkbox("show probability", True)
+            self._show_slice.on_update(lambda _: self._request("slice"))
+            return
+        self._add_surface_controls(gui)
+        self._add_slice_controls(gui)
+        with gui.add_folder("Clusters"):
+            occupied = gui.add_checkbox("show occupied", False)
+            free = gui.add_checkbox("show free", False)
+        self._stage.follow("/clusters/occupied", occupied)
+        self._stage.follow("/clusters/free", free)
+
+    def _add_surface_controls(self, gui: Any) -> None:
         with gui.add_folder("Surface"):
-            self._show_mesh = gui.add_checkbox("show surface", True)
+            show = gui.add_checkbox("show surface", True)
             self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5, hint=THRESHOLD_HINT)
             available = has_variance(self._model)
             colors = [color for color in COLORS if available or color != "variance"]
             self._color = gui.add_dropdown("color", colors, initial_value="height")
+        self._stage.follow("/surface", show)
+        self._threshold.on_update(lambda _: self._request("surface"))
+        self._color.on_update(lambda _: self._request("surface"))
+
+    def _add_slice_controls(self, gui: Any) -> None:
         lower, upper = (end.numpy() - self.offset for end in self._core)
         with gui.add_folder("Slice"):
             self._show_slice = gui.add_checkbox("show slice", False)
@@ -154,19 +175,8 @@ class MapViewer:
                 0.05,
                 float(np.round((lower[2] + upper[2]) * 10) / 20),
             )
-        with gui.add_folder("Clusters"):
-            self._show_occupied = gui.add_checkbox("show occupied", False)
-            self._show_free = gui.add_checkbox("show free", False)
-        self._threshold.on_update(lambda _: self._request("surface"))
-        self._color.on_update(lambda _: self._request("surface"))
         for control in (self._show_slice, self._height):
             control.on_update(lambda _: self._request("slice"))
-        for name, control in (
-            ("/surface", self._show_mesh),
-            ("/clusters/occupied", self._show_occupied),
-            ("/clusters/free", self._show_free),
-        ):
-            self._stage.follow(name, control)
 
     def _add_scans(self, scans: Scans) -> None:
         gui = self.server.gui
@@ -197,6 +207,8 @@ class MapViewer:
             try:
                 self._status.content = "*drawing ...*"
                 self._draw(model, jobs)
+            except _OutdatedError:
+                pass
             except Exception as error:
                 self._status.content = f"**{type(error).__name__}**: {error}"
             with self._changed:
@@ -205,26 +217,50 @@ class MapViewer:
 
     def _draw(self, model: OccupancyMap, jobs: set[str]) -> None:
         """Redraw what the jobs name: "slice", "surface", or "map" for everything."""
-        if "map" in jobs or self._lattice is None:
-            resolution = self.config.resolution or view_resolution(model)
-            self._lattice = surface_lattice(model, resolution, keep=True)
+        if model.dim == 2:
+            self._stage.draw_slice(model, 0.0 if self._show_slice.value else None, self._core)
+            self._status.content = f"{len(model.weights):,} clusters. {self._middle()}"
+            return
+        if "map" in jobs or not self._lattices:
+            fine = self.config.resolution or view_resolution(model)
+            self._lattices = [surface_lattice(model, r, keep=True) for r in (DRAFT * fine, fine)]
             self._stage.draw_clusters(model)
         if jobs & {"map", "slice"}:
             height = float(self._height.value) if self._show_slice.value else None
             self._stage.draw_slice(model, height, self._core)
         if jobs & {"map", "surface"}:
-            self._report = self._draw_surface(model, self._lattice)
+            for lattice, is_final in zip(self._lattices, (False, True), strict=True):
+                self._report = self._draw_surface(model, lattice, is_final)
         self._status.content = self._report
 
-    def _draw_surface(self, model: OccupancyMap, lattice: SurfaceLattice) -> str:
-        """Show the surface; returns the status line."""
-        mesh = lattice_mesh(model, lattice, float(self._threshold.value), color=self._color.value)
+    def _draw_surface(self, model: OccupancyMap, lattice: Lattice | None, is_final: bool) -> str:
+        """Show the surface; returns the status line. A final one gives way to a change of a control."""
+
+        def check(_: int = 0) -> None:
+            if self._closed or (is_final and "surface" in self._jobs):
+                raise _OutdatedError
+
+        mesh = lattice_mesh(
+            model,
+            lattice,
+            float(self._threshold.value),
+            color=self._color.value,
+            report=check,
+        )
+        check()
         shown = self._stage.draw_surface(mesh)
         return (
             f"{len(model.weights):,} clusters; surface of {len(mesh.faces):,} faces, "
-            f"{shown:,} shown, cells of {lattice.resolution:.3g} m. "
-            f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
+            f"{shown:,} shown, cells of {lattice.resolution if lattice else 0:.3g} m. "
+            f"{self._middle()}"
         )
+
+    def _middle(self) -> str:
+        return f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
+
+
+class _OutdatedError(Exception):
+    """What is being drawn is not wanted any more."""
 
 
 class LiveView:
@@ -264,10 +300,11 @@ def _new_server(config: ViewConfig) -> Any:
     return viser.ViserServer(config.host, config.port, label="lardhm", verbose=False)
 
 
-def _checked_snapshot(model: OccupancyMap) -> OccupancyMap:
+def _checked_snapshot(model: OccupancyMap, dimensions: tuple[int, ...] = (2, 3)) -> OccupancyMap:
     """A copy of the map that later changes to the map do not affect, or a ValueError."""
-    if model.dim != 3:
-        raise ValueError(f"model must be a 3-D map to be viewed; got {model.dim}-D")
+    if model.dim not in dimensions:
+        allowed = " or ".join(f"{dim}-D" for dim in dimensions)
+        raise ValueError(f"model must be a {allowed} map to be viewed; got {model.dim}-D")
     copied = snapshot(model)
     if len(copied.centers) == 0:
         raise ValueError("the map must hold clusters to be viewed; it is empty: fit it first")
