@@ -156,16 +156,13 @@ class LardHilbertMap(parameters.MapParameters):
         """
         if len(self) == 0 or not native.supports(self.centers):
             return None
-        rays = (origins - self.origin, directions)
-        tensors = (self.centers, self.raw_scale_tril, self.weights)
+        rays, tensors = (origins - self.origin, directions), self._tensors()[:3]
         return native.raycast(rays, march, tensors, self.kernel, self._fresh_index())
 
     def _query(self, points: TensorLike, probability: bool) -> Tensor:
         local = self._to_map_frame(points)
-        flat = local.reshape(-1, self.dim)
-        answer = native.occupancy(
-            flat, *self._tensors(), probability=probability, index=self._fresh_index()
-        )
+        flat, index = local.reshape(-1, self.dim), self._fresh_index()
+        answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
         return answer.reshape(local.shape[:-1])
 
     def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
@@ -338,18 +335,16 @@ class LardHilbertMap(parameters.MapParameters):
             ValueError: wrong shapes, or rotation is not a rotation.
         """
         state = parameters.read_state(self)
-        moved = map_merging.moved(state, self.origin, rotation, translation)
         kept = self._copied_posterior(slice(None))
-        parameters.write_state(self, *moved)
+        parameters.write_state(self, *map_merging.moved(state, self.origin, rotation, translation))
         self.posterior_means, self.posterior_variances, self.posterior_scales = kept
         return self
 
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
-        Clusters of surfaces and of unknown space that limit the remaining free space are kept, so that
-        places beyond the radius do not become free.
-        The posterior of the other weights is kept.
+        Clusters of surfaces and of unknown space that limit the remaining free space stay, so that
+        places beyond the radius do not become free. The posterior of the other weights is kept.
 
         Returns:
             This map.

@@ -109,8 +109,9 @@ def check_sphere(center: Tensor, radius: float, origin: Tensor) -> Tensor:
 def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> Tensor:
     """(M,) mask of the clusters to keep: within ``radius`` [m] of a position, or bounding those.
 
-    The position is in the map frame. Kernels of free clusters extend beyond the sphere. Clusters outside that are not free and that such
-    a kernel reaches are kept, so that walls outside the sphere do not become free space.
+    Kernels of free clusters extend beyond the sphere. Clusters outside that are not free and that such
+    a kernel reaches are kept, so that walls outside the sphere do not become free space. The position
+    is in the map frame.
     """
     kept = torch.linalg.vector_norm(state.centers - center, dim=1) <= radius
     inside = state.rows(kept)
