@@ -212,8 +212,8 @@ class LardHilbertMap(parameters.MapParameters):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
-        config: FitConfig | None = None,
         progress: bool = False,
+        config: FitConfig | None = None,
     ) -> LardHilbertMap:
         """Fit the map to labelled points. Existing clusters are discarded.
 
@@ -227,8 +227,8 @@ class LardHilbertMap(parameters.MapParameters):
                 leaves the remainder to the other. None: chosen from the data
                 (`clustering.choose_num_clusters`).
             seed: random seed of clustering and training.
-            config: training settings of the weights.
             progress: show a progress bar on a terminal.
+            config: training settings of the weights.
 
         Returns:
             This map.

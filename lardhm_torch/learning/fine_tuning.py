@@ -29,11 +29,11 @@ def fine_tune(
     *,
     ray_id: Tensor | None = None,
     resample: Callable[[int], Samples] | None = None,
-    config: TuneConfig | None = None,
     seed: int = 0,
     state: State | None = None,
     after_epoch: Callable[[State], None] | None = None,
     progress: bool = False,
+    config: TuneConfig | None = None,
 ) -> list[float]:
     """Optimize centers, length-scales and weights of a fitted map on the balanced log-loss.
 
@@ -55,12 +55,12 @@ def fine_tune(
         resample: function that returns new samples of the same rays, given the number of the epoch
             (from 1). New free points in every epoch reduce overfitting:
             ``lambda epoch: sample_rays(scans, seed=seed + epoch)``.
-        config: learning rates, epochs and parameters to optimize; None: the defaults.
         seed: random seed of the hold-out and the batches.
         state: state passed to ``after_epoch`` in an earlier run, which is resumed. The result is that
             of an uninterrupted run if all other arguments are the same.
         after_epoch: callback that receives the state after every epoch, e.g. to save it.
         progress: show a progress bar on a terminal.
+        config: learning rates, epochs and parameters to optimize; None: the defaults.
 
     Returns:
         Mean balanced log-loss on held-out points (on training points if none are held out), before
