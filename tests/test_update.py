@@ -62,7 +62,7 @@ def test_evidence_does_not_depend_on_order_parts_or_repetitions(seed, parts):
     assert torch.equal(kept_counts(whole), owners.bincount(minlength=6).clamp(max=EVIDENCE))
 
 
-def test_clusters_are_those_of_points_that_were_seen_and_nearly_all_are_counted():
+def test_clusters_are_those_of_points_that_were_seen():
     model, seen = LardHilbertMap().double(), []
     for seed in range(4):
         points, labels = wall(seed=seed)
@@ -71,7 +71,6 @@ def test_clusters_are_those_of_points_that_were_seen_and_nearly_all_are_counted(
     kept = (model.evidence[model.evidence.isfinite().all(dim=2)] + model.origin).float()
     everything = torch.cat(seen).float()
     assert torch.isin(kept[:, 1], everything[:, 1]).all()
-    assert 0.95 < int(model.counts[model.is_occupied].sum()) / (4 * 600) <= 1
     moments = evidence_moments(model.evidence)
     torch.testing.assert_close(model.means, moments.means)
     changed = model.counts > 1

@@ -35,6 +35,7 @@ from lardhm_torch.learning.map_state import MapState, factor_covariances, new_ro
 from lardhm_torch.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
+SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
 NEW_ITERATIONS = 5  # of k-means for new clusters
 
 
@@ -91,7 +92,7 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     """Divide clusters of large loss in two; the second halves are appended."""
     divided = torch.zeros_like(known.is_occupied)
     room = rule.limit - len(known)
-    large = (known.losses > rule.split_loss) & (kept_counts(known.evidence) >= 2 * MIN_COUNT)
+    large = (known.losses > rule.split_loss) & (kept_counts(known.evidence) >= SPLIT)
     rows = large.nonzero().squeeze(1)
     if room <= 0 or len(rows) == 0:
         return known, divided

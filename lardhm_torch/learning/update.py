@@ -161,27 +161,27 @@ def _regrouped(
     part: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, few: bool, task: Task
 ) -> MapState:
     """All classes regrouped with their new points."""
-    kinds = part.kinds
+    kinds, floor = part.kinds, task.kernel.min_lengthscale
     classes = split_labels(points, labels)
-    limits = _limits(part, classes, num_clusters, few)
-    for kind, (members, limit) in enumerate(zip(classes, limits, strict=True)):
+    limit = _most_occupied(part, len(classes[0]), num_clusters, few)
+    for kind, members in enumerate(classes):
         own = (kinds == kind).nonzero().squeeze(1)
-        floor = task.kernel.min_lengthscale
         rule = Rule(kind, max(limit, len(own)), few, task.config.split_loss, floor)
         if len(own) or len(members):
             part = part.put(own, regrouped(part.rows(own), members, rule, task.rng))
+        if kind == 0:  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
+            kept = part.is_occupied & (kept_counts(part.evidence) > 0)
+            occupied = int(kept.sum()) if num_clusters is None and bool(kept.any()) else limit
+        limit = (2 - kind) * occupied if kind < 2 else 0
     return part
 
 
-def _limits(
-    part: MapState, classes: list[Tensor], num_clusters: int | None, few: bool
-) -> list[int]:
-    """Maximum number of clusters of each class near a scan."""
-    if num_clusters is None:
-        hits = int(part.counts[part.is_occupied].sum()) + len(classes[0])
-        occupied = min(MAX_CHOSEN, max(hits if few else 1, hits // POINTS_PER_CLUSTER))
-        return [occupied, 2 * occupied, occupied]
-    return [num_clusters // 4, num_clusters // 2, num_clusters // 4]
+def _most_occupied(part: MapState, num_hits: int, num_clusters: int | None, few: bool) -> int:
+    """Maximum number of occupied clusters near a scan."""
+    if num_clusters is not None:
+        return num_clusters // 4
+    hits = int(part.counts[part.is_occupied].sum()) + num_hits
+    return min(MAX_CHOSEN, max(hits if few else 1, hits // POINTS_PER_CLUSTER))
 
 
 def _as_in_paper(
