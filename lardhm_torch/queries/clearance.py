@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, TensorLike, num_neighbors, to_tensor
 from lardhm_torch.queries.distance import height_and_side, nearest_faces, to_nearest
-from lardhm_torch.queries.faces import Faces, plates_of, surface_faces
+from lardhm_torch.queries.faces import Faces, kernel_tensors, plates_of, surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
 
 MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
@@ -70,9 +70,7 @@ _kept = weakref.WeakKeyDictionary()
 @torch.no_grad()
 def obstacle_plates(model: OccupancyMap, target: float) -> _Obstacles:
     """Plates around every point whose log-odds exceed a target above 0; kept with the map."""
-    parts = (model.origin, model.weights, model.centers, model.scale_tril)
-    source = tuple(part.detach() for part in parts)
-    source = (*source, model.origin.new_tensor(target))
+    source = (*kernel_tensors(model), model.origin.new_tensor(target))
     before, plates = _kept.get(model, ((), None))
     if plates is not None and all(map(torch.equal, source, before)):
         return plates
