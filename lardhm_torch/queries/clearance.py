@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, num_neighbors, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, in_memory, num_neighbors, to_tensor
 from lardhm_torch.queries.distance import height_and_side, nearest_faces, to_nearest
 from lardhm_torch.queries.faces import Faces, kernel_tensors, plates_of, surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
@@ -50,6 +50,7 @@ def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -
     points = to_tensor(points, "points", model.origin.device)
     if points.ndim == 0 or points.shape[-1] != model.dim:
         raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
+    model = in_memory(model)
     local = points.reshape(-1, model.dim) - model.origin
     plates = obstacle_plates(model, threshold_log_odds(threshold) + EVIDENCE)
     bounds = [to_nearest(local, part, torch.inf) for part in plates]
