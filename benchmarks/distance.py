@@ -1,6 +1,7 @@
 """Distances: errors against true surfaces and dense hits, bounds, calibration, and time.
 
 Usage: python benchmarks/distance.py [--data DATA] [--only error bound calibration speed rays update]
+           [--reliability PNG]
 
 error: the simulated room (default fit) against its mesh, and half of at most 120,000 rays of each set
 against the nearest of all hits of the set, at `unif` points of held-out rays. bound: `clearance`
@@ -32,7 +33,11 @@ from lardhm_torch import (
     simulate_room,
     split_rays,
 )
-from lardhm_torch.evaluation.calibration import calibration_error
+from lardhm_torch.evaluation.calibration import (
+    calibration_error,
+    draw_reliability,
+    reliability,
+)
 from lardhm_torch.evaluation.held_out import held_out_points, protocol_rays
 from lardhm_torch.queries.faces import surface_faces
 from lardhm_torch.simulation import room_mesh
@@ -130,17 +135,22 @@ def bounds() -> None:
         )
 
 
-def calibration() -> None:
+def calibration(picture: Path | None) -> None:
+    diagrams = {}
     for seed in ROOMS:
         model, points, true = room_case(seed)
         rng = torch.Generator().manual_seed(1)
-        radii = (true + 0.1 * torch.randn(len(true), generator=rng, dtype=torch.float64)).clamp(
-            0.01
+        off = 0.1 * torch.randn(len(true), generator=rng, dtype=torch.float64)
+        radii = (true + off).clamp(min=0.01)
+        answers = (
+            collision_probability(model, points, radii),
+            (true < radii).double(),
+            torch.full_like(true, 1 / len(true)),
         )
-        found = collision_probability(model, points, radii)
-        even = torch.full_like(found, 1 / len(found))
-        error = calibration_error(found, (true < radii).double(), even)
-        print(f"calibration, room, seed {seed}: ECE {error:.4f}", flush=True)
+        diagrams[f"room, seed {seed}"] = reliability(*answers)
+        print(f"calibration, room, seed {seed}: ECE {calibration_error(*answers):.4f}", flush=True)
+    if picture is not None:
+        draw_reliability(diagrams, picture)
 
 
 def speed(data: Path) -> None:
@@ -223,13 +233,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Distances: errors, bounds, calibration, time.")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--only", nargs="+", choices=parts, default=parts)
+    parser.add_argument("--reliability", type=Path, help="picture of the calibration (.png)")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(describe(conditions()))
     calls = {
         "error": lambda: errors(arguments.data),
         "bound": bounds,
-        "calibration": calibration,
+        "calibration": lambda: calibration(arguments.reliability),
         "speed": lambda: speed(arguments.data),
         "rays": lambda: rays(arguments.data),
         "update": lambda: update(arguments.data),

@@ -107,6 +107,11 @@ def local_parts(
         yield torch.arange(len(lower), device=lower.device), model
 
 
+def in_memory(model: OccupancyMap) -> OccupancyMap:
+    """The map of all tiles of a tiled map, which must fit in memory; any other map itself."""
+    return model.in_memory() if hasattr(model, "in_memory") else model
+
+
 def num_neighbors(model: OccupancyMap) -> int:
     """Number k of nearest clusters used per point; the number of clusters if the map has no k."""
     return model.num_neighbors if hasattr(model, "num_neighbors") else len(model.weights)

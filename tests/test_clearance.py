@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_maps import F64, ball, radius_where, random_map
+from tiled_maps import tiled
 
 from lardhm_torch import LardHilbertMap, sample_rays, simulate_room, surface_distance
 from lardhm_torch.queries.clearance import clearance
@@ -97,3 +98,11 @@ def test_a_faded_obstacle_in_free_space_does_not_count():
     assert float(clearance(model, origin)) < 0
     model.weights[torch.linalg.vector_norm(model.centers + model.origin, dim=1) < 3] = 0.1
     assert float(clearance(model, origin)) > 5
+
+
+def test_tiles_have_the_clearance_of_the_whole_map(tmp_path, monkeypatch):
+    model = fitted_map()
+    tiles = tiled(model, tmp_path, monkeypatch, edge=2.0)
+    points = 4 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    whole, found = clearance(model, points), clearance(tiles, points)
+    torch.testing.assert_close(found, whole, rtol=0, atol=1e-4)

@@ -71,5 +71,5 @@ def draw_reliability(diagrams: dict[str, Tensor], path: str | Path) -> None:
         axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
         axes.plot(predicted.numpy(), observed.numpy(), marker="o", markersize=4)
         axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", title=f"{name}: ECE {error:.3f}")
-        axes.set(xlabel="probability of occupancy", ylabel="fraction occupied")
+        axes.set(xlabel="predicted probability", ylabel="observed fraction")
     figure.savefig(path, dpi=130)

@@ -79,8 +79,8 @@ def body_distance(
     Raises:
         ValueError: poses have another shape, or max_distance is not > 0.
     """
-    centers = body.placed(poses)
-    return (signed_distance(model, centers, max_distance) - body.radii).amin(dim=-1)
+    distance = signed_distance(model, body.placed(poses), max_distance)
+    return (distance - body.radii.to(distance.device)).amin(dim=-1)
 
 
 def capsule_distance(

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, num_neighbors, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, in_memory, num_neighbors, to_tensor
 from lardhm_torch.queries.distance import height_and_side, nearest_faces, to_nearest
-from lardhm_torch.queries.faces import Faces, plates_of, surface_faces
+from lardhm_torch.queries.faces import Faces, kernel_tensors, plates_of, surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
 
 MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
@@ -50,6 +50,7 @@ def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -
     points = to_tensor(points, "points", model.origin.device)
     if points.ndim == 0 or points.shape[-1] != model.dim:
         raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
+    model = in_memory(model)
     local = points.reshape(-1, model.dim) - model.origin
     plates = obstacle_plates(model, threshold_log_odds(threshold) + EVIDENCE)
     bounds = [to_nearest(local, part, torch.inf) for part in plates]
@@ -70,9 +71,7 @@ _kept = weakref.WeakKeyDictionary()
 @torch.no_grad()
 def obstacle_plates(model: OccupancyMap, target: float) -> _Obstacles:
     """Plates around every point whose log-odds exceed a target above 0; kept with the map."""
-    parts = (model.origin, model.weights, model.centers, model.scale_tril)
-    source = tuple(part.detach() for part in parts)
-    source = (*source, model.origin.new_tensor(target))
+    source = (*kernel_tensors(model), model.origin.new_tensor(target))
     before, plates = _kept.get(model, ((), None))
     if plates is not None and all(map(torch.equal, source, before)):
         return plates

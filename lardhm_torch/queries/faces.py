@@ -84,12 +84,19 @@ def surface_faces(model: OccupancyMap) -> Faces:
     return faces
 
 
-def _source(model: OccupancyMap) -> tuple[Tensor, ...]:
-    """Everything that the plates are made from: origin, weights, kernels, and the hits' moments."""
+def kernel_tensors(model: OccupancyMap) -> tuple[Tensor, ...]:
+    """What determines the log-odds of a map: origin, weights, centers, and factors as it stores them."""
     raw = getattr(model, "raw_scale_tril", None)
-    kernels = model.scale_tril if raw is None else raw
-    return (model.origin, model.weights.detach(), model.centers.detach(), kernels.detach(),
-            *_moments(model))  # fmt: skip
+    factors = model.scale_tril if raw is None else raw
+    return model.origin, *(t.detach() for t in (model.weights, model.centers, factors))
+
+
+def _source(model: OccupancyMap) -> tuple[Tensor, ...]:
+    """Everything that the plates are made from: `kernel_tensors`, and the hits' moments if stored."""
+    if not hasattr(model, "scatters"):
+        return kernel_tensors(model)
+    names = ("is_occupied", "counts", "means", "scatters")
+    return *kernel_tensors(model), *(getattr(model, name) for name in names)
 
 
 def _moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor]:
@@ -111,7 +118,8 @@ def _moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor]:
 
 def _updated(model: OccupancyMap, source: tuple[Tensor, ...], old: _Plates | None) -> _Plates:
     """Plates of the map: the old ones, and new ones where a cluster near them has changed."""
-    origin, weights, centers, _, is_hit, means, _ = source
+    origin, weights, centers = source[:3]
+    is_hit, means, covariances = _moments(model)
     dim, count = model.dim, len(weights)
     new = _Plates(
         tuple(tensor.clone() for tensor in source),
@@ -134,7 +142,7 @@ def _updated(model: OccupancyMap, source: tuple[Tensor, ...], old: _Plates | Non
         places = torch.cat([centers[changed], old.source[2][changed[:kept]]])
         rows = rows[changed[rows] | _near(model, means[rows], places)]
     for some in rows.split(CHUNK_CLUSTERS):
-        _make_plates(model, some, new)
+        _make_plates(model, some, (means[some], covariances[some]), new)
     return new
 
 
@@ -149,11 +157,12 @@ def _near(model: OccupancyMap, means: Tensor, places: Tensor) -> Tensor:
     return torch.linalg.vector_norm(closest - means, dim=1) <= reach + 4 * max(SIDES)
 
 
-def _make_plates(model: OccupancyMap, rows: Tensor, plates: _Plates) -> None:
-    """Write the plates of some clusters of hits."""
-    *_, means, covariances = plates.source
-    centers, dim = means[rows].double(), model.dim
-    values, axes = torch.linalg.eigh(covariances[rows].double())
+def _make_plates(
+    model: OccupancyMap, rows: Tensor, moments: tuple[Tensor, Tensor], plates: _Plates
+) -> None:
+    """Write the plates of some clusters of hits, given their means and covariances."""
+    centers, dim = moments[0].double(), model.dim
+    values, axes = torch.linalg.eigh(moments[1].double())
     half = values.clamp(min=0).sqrt()
     half[:, 1:] *= EDGE
 

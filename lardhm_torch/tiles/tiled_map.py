@@ -212,6 +212,10 @@ class TiledMap:
             )
         return self._local.merged((lower, upper))
 
+    def in_memory(self) -> LardHilbertMap:
+        """The map of all tiles, kept in memory; a `ValueError` if it exceeds the memory limit."""
+        return self._local.whole()
+
     @torch.no_grad()
     def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
         """Groups of boxes that are near each other, and the map that answers in each group.
