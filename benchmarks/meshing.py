@@ -25,15 +25,15 @@ from typing import Any
 import numpy as np
 from conditions import ROOT, conditions, describe
 
+from lardhm_torch import load_scans, save_scans, simulate_room, split_rays
+from lardhm_torch.evaluation.held_out import protocol_rays
+
 # Run in the process of a checkout.
 FIT = """
 import sys
-from lardhm_torch import LardHilbertMap, load_scans, sample_rays, simulate_room, split_rays
-from lardhm_torch.evaluation.held_out import protocol_rays
+from lardhm_torch import LardHilbertMap, load_scans, sample_rays
 path, to = sys.argv[1:]
-scans = simulate_room(seed=0) if path == "room" else load_scans(path)
-train, _ = split_rays(protocol_rays(scans, 120_000), 0.5, 0)
-samples = sample_rays(train, seed=0)
+samples = sample_rays(load_scans(path), seed=0)
 LardHilbertMap().fit(samples.points, samples.labels, seed=0).save(to)
 """
 MESH = """
@@ -122,13 +122,18 @@ def main() -> None:
         head + f"{'faces':>12}{'x wall':>9}{'x CPU':>9}{'x MB':>9}  (other)" * (len(checkouts) - 1)
     )
     for name in arguments.sets:
-        source = name if name == "room" else str((arguments.data / name / "scans.npz").resolve())
+        is_room = name == "room"
+        scans = (
+            simulate_room(seed=0) if is_room else load_scans(arguments.data / name / "scans.npz")
+        )
+        train, _ = split_rays(protocol_rays(scans, 120_000), 0.5, 0)
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
+            save_scans(train, folder / "rays.npz")
             maps = [folder / f"{number}.pt" for number in range(len(checkouts))]
             for checkout, path in zip(checkouts, maps, strict=True):
                 if not (arguments.same_map and checkout is not ROOT):
-                    run(checkout, FIT, source, str(path))
+                    run(checkout, FIT, str(folder / "rays.npz"), str(path))
             if arguments.same_map:
                 maps = [maps[0]] * len(checkouts)
             for resolution in arguments.resolutions:
