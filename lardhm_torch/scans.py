@@ -46,16 +46,18 @@ class Scans:
             "is_return": (self.is_return, torch.bool, True),
             "target_index": (self.target_index, torch.long, 1),
         }
+        is_checked = rays == 0 or (self.scan_id is None and len(origins) > 0)
         for name, (value, dtype, default) in columns.items():
             if value is None:
-                value = torch.full((rays,), default, device=device)
-            value = torch.as_tensor(value, device=device).to(dtype)
+                value = torch.full((rays,), default, dtype=dtype, device=device)
+            else:
+                value = torch.as_tensor(value, device=device).to(dtype)
             if value.shape != (rays,):
                 raise ValueError(
                     f"{name} must be ({rays},), one entry per ray; got {tuple(value.shape)}"
                 )
             object.__setattr__(self, name, value)
-        if rays and (self.scan_id.min() < 0 or self.scan_id.max() >= len(origins)):
+        if not is_checked and (self.scan_id.min() < 0 or self.scan_id.max() >= len(origins)):
             raise ValueError(
                 f"scan_id must be 0 to {len(origins) - 1}, one origin per scan; "
                 f"got {int(self.scan_id.min())} to {int(self.scan_id.max())}"

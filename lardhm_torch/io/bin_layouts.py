@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,10 +14,6 @@ NUSCENES: Layout = ("<f4", 5)
 
 _COLUMNS = {"<f4": (4, 3, 5, 6, 7, 8), "<f8": (3, 4, 5, 6)}
 _PROBED_BYTES = 3360 * 4  # a whole number of points in every layout
-_NUMBERS = (3, 4, 5, 6, 7, 8)  # of columns
-_CYCLE = 840  # a whole number of points for all of them
-_COLUMN_OF = np.hstack([np.tile(np.eye(n), (_CYCLE // n, 1)) for n in _NUMBERS])
-_STARTS = np.cumsum(_NUMBERS, dtype=np.int64) - np.array(_NUMBERS)
 _LEAST_POINTS = 30  # with fewer, the number of columns cannot be recognized
 _CLEARLY = 0.3  # in mean log variance: another number of columns must fit KITTI's better by this
 _MULTIPLE = 1.0  # the same for twice as many columns, which always fit a little better
@@ -36,13 +35,15 @@ def find_layout(content: NDArray[np.uint8], is_nuscenes: bool = False) -> Layout
     Raises:
         ValueError: no layout fits, or several do.
     """
-    probe = content[: min(_PROBED_BYTES, len(content) // 8 * 8)]
-    words = probe.view("<u4")
-    kind = "<f8" if _are_doubles(words) else "<f4"
+    probe = content[:_PROBED_BYTES]
+    words = probe[: len(probe) // 8 * 8].view("<u4")
+    exponents = words & _EXPONENT
+    is_huge = (exponents > _HUGE) & (exponents < _EXPONENT)
+    kind = "<f8" if _are_doubles(words, is_huge) else "<f4"
     size = np.dtype(kind).itemsize
-    fitting = [n for n in _COLUMNS[kind] if len(content) and len(content) % (size * n) == 0]
+    fitting = tuple(n for n in _COLUMNS[kind] if len(content) and len(content) % (size * n) == 0)
     layout = None
-    if kind == "<f8" or not _are_wild(words):
+    if fitting and (kind == "<f8" or not _are_wild(words, exponents, is_huge)):
         layout = _layout_of(probe.view(kind), kind, fitting, is_nuscenes)
     if layout is None:
         raise ValueError(
@@ -52,13 +53,15 @@ def find_layout(content: NDArray[np.uint8], is_nuscenes: bool = False) -> Layout
     return layout
 
 
-def _layout_of(values: NDArray, kind: str, fitting: list[int], is_nuscenes: bool) -> Layout | None:
+def _layout_of(
+    values: NDArray, kind: str, fitting: tuple[int, ...], is_nuscenes: bool
+) -> Layout | None:
     """The layout among numbers of columns that fit the size of the file; None if it is not clear."""
     is_kitti_size = kind == "<f4" and 4 in fitting
     if len(values) < 4 * _LEAST_POINTS:
         return KITTI if is_kitti_size else None
-    all_scores = _mean_log_variances(values.astype(np.float64))
-    scores = {n: all_scores[n] + _MULTIPLE * (n % 2 == 0 and n // 2 in fitting) for n in fitting}
+    scores = _mean_log_variances(values, fitting)
+    scores = {n: scores[n] + _MULTIPLE * (n % 2 == 0 and n // 2 in fitting) for n in fitting}
     least = min(scores.values(), default=np.inf)
     if not np.isfinite(least):
         return KITTI if is_kitti_size else None  # no point is finite
@@ -76,41 +79,54 @@ def _layout_of(values: NDArray, kind: str, fitting: list[int], is_nuscenes: bool
     return kind, next(n for n in fitting if scores[n] <= least + _CLEARLY / 2)
 
 
-def _are_doubles(words: NDArray[np.uint32]) -> bool:
+def _are_doubles(words: NDArray[np.uint32], is_huge: NDArray[np.bool_]) -> bool:
     """Whether two words each are a double: the lower one is noise, or zero where floats end."""
     lower, upper = words[::2], words[1::2]
     num_coarse = len(lower) - np.count_nonzero(lower & 0x1FFFFFFF)
     is_coarse = num_coarse > 0.9 * len(lower) and (upper & 0x1FFFFFFF).any()
-    if not is_coarse and _num_huge(lower) <= 0.005 * len(lower):
+    if not is_coarse and np.count_nonzero(is_huge[::2]) <= 0.005 * len(lower):
         return False
     exponents = (upper >> 20) & 0x7FF
     return bool(((exponents <= 1023 + 63) | (exponents == 0x7FF)).mean() > 0.99)
 
 
-def _num_huge(words: NDArray[np.uint32]) -> int:
-    """How many floats are beyond 10^19, yet finite."""
-    exponents = words & _EXPONENT
-    return int(np.count_nonzero((exponents > _HUGE) & (exponents < _EXPONENT)))
-
-
-def _are_wild(words: NDArray[np.uint32]) -> bool:
+def _are_wild(
+    words: NDArray[np.uint32], exponents: NDArray[np.uint32], is_huge: NDArray[np.bool_]
+) -> bool:
     """Whether too many floats are no coordinates, intensities or times."""
-    num_tiny = np.count_nonzero((words & _EXPONENT) < _TINY)
-    num_tiny -= len(words) - np.count_nonzero(words & ~_SIGN)  # zeros are none
-    return bool(num_tiny > 0.35 * len(words) or _num_huge(words) > 0.05 * len(words))
+    num_tiny = np.count_nonzero(exponents < _TINY)
+    if num_tiny > 0.35 * len(words):
+        num_tiny -= len(words) - np.count_nonzero(words & ~_SIGN)  # zeros are none
+    return bool(num_tiny > 0.35 * len(words) or np.count_nonzero(is_huge) > 0.05 * len(words))
 
 
-def _mean_log_variances(values: NDArray[np.float64]) -> dict[int, float]:
+def _mean_log_variances(values: NDArray, numbers: tuple[int, ...]) -> dict[int, float]:
     """How much the columns vary, for each number of columns; infinite without finite values."""
-    padded = np.full(-(-len(values) // _CYCLE) * _CYCLE, np.nan)
-    padded[: len(values)] = values
-    is_finite = np.isfinite(padded)
-    padded[~is_finite] = 0.0
-    sums = [part.reshape(-1, _CYCLE).sum(axis=0) for part in (is_finite, padded, padded**2)]
-    count, total, squares = np.array(sums) @ _COLUMN_OF
+    column_of, mean_of = _columns_of(numbers)
+    is_finite = np.isfinite(values)
+    parts = np.empty((3, len(values)))
+    parts[0], parts[1] = is_finite, values
+    all_finite = is_finite.all()
+    if not all_finite:
+        parts[1, ~is_finite] = 0.0
+    np.square(parts[1], out=parts[2])
+    cycles = parts.reshape(3, -1, len(column_of))
+    count, total, squares = (np.ones(cycles.shape[1]) @ cycles) @ column_of
     known = np.maximum(count, 1.0)
-    variances = np.maximum(squares / known - (total / known) ** 2, 0.0)
-    logs = np.log(variances + 1e-6)
-    logs[count == 0] = np.inf
-    means = np.add.reduceat(logs, _STARTS) / _NUMBERS
-    return dict(zip(_NUMBERS, means.tolist(), strict=True))
+    logs = np.log(np.maximum(squares / known - (total / known) ** 2, 0.0) + 1e-6)
+    means = logs @ mean_of
+    if not all_finite:
+        means[(count == 0) @ mean_of > 0] = np.inf
+    return dict(zip(numbers, means.tolist(), strict=True))
+
+
+@lru_cache
+def _columns_of(numbers: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(cycle, C) which value belongs to which of all columns, and (C, n) the mean of each layout.
+
+    A cycle is a whole number of points in every layout.
+    """
+    cycle = math.lcm(*numbers)
+    column_of = np.hstack([np.tile(np.eye(n), (cycle // n, 1)) for n in numbers])
+    layout_of = np.repeat(np.arange(len(numbers)), numbers)
+    return column_of, np.eye(len(numbers))[layout_of] / numbers

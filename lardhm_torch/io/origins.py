@@ -158,6 +158,6 @@ def scans_from(readout: Readout, file: Path) -> Scans:
         scans = Scans(**{k: torch.from_numpy(v) for k, v in columns.items() if v is not None})
     except ValueError as error:
         raise ValueError(f"{file} does not hold scans: {error}") from error
-    if not torch.isfinite(scans.origins).all():
+    if not np.isfinite(scans.origins.numpy()).all():
         raise ValueError(f"{file}: origins must be finite; got {scans.origins.tolist()[:3]}")
     return scans

@@ -93,7 +93,7 @@ def without_zeros(readout: Readout) -> Readout:
     be phantoms; where the sensor is at zero itself, rays without length.
     """
     is_zero = rows_at_zero(readout.ends)
-    count = int(is_zero.sum())
+    count = int(np.count_nonzero(is_zero))
     if not count:
         return readout
     note = Note("points at exactly zero are left out (no measurement)", count, is_loss=True)
