@@ -19,6 +19,7 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.points import UNKNOWN
 
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
+NARROWEST = 0.03  # [m] standard deviation of kernels here: few points pass through smaller ones
 DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
 FEWEST = 3  # contradicted clusters that would keep fewer points keep none
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
@@ -39,6 +40,7 @@ def doubted(known: MapState, points: Tensor, labels: Tensor, kernel: Kernel) -> 
     points, is_hit = points[seen], labels[seen] > UNKNOWN
     if len(known) == 0 or len(points) == 0:
         return known.doubts
+    kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, NARROWEST))
     index = native.build_index(known.centers, kernel.num_neighbors)
     indices, values = native.nearest_features(
         points, known.centers, known.raw_scale_tril, kernel, index

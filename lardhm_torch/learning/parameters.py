@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.map_state import EVIDENCE, MapState
+from lardhm_torch.learning.map_state import EVIDENCE, MapState, no_evidence
 
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
 HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
@@ -247,11 +247,12 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
 def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
     """Add empty evidence to the state dict of a map that was saved without it."""
     centers = state.get(prefix + "centers")
-    if isinstance(centers, Tensor) and centers.ndim == 2:
-        shape = (len(centers), EVIDENCE, centers.shape[1])
-        state.setdefault(prefix + "evidence", centers.new_full(shape, torch.inf))
-        for name in ("losses", "doubts", "fresh"):
-            state.setdefault(prefix + name, centers.new_zeros(shape[:1]))
+    if not isinstance(centers, Tensor) or centers.ndim != 2:
+        return
+    for name in HISTORY:
+        if len(state.get(prefix + name, ())) == 0:
+            rows = centers.new_zeros(len(centers))
+            state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
 
 
 def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
