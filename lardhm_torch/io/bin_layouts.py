@@ -41,8 +41,9 @@ def find_layout(content: NDArray[np.uint8], is_nuscenes: bool = False) -> Layout
     is_huge = exponents > _HUGE
     if np.count_nonzero(is_huge):
         is_huge &= exponents < _EXPONENT
-    num_huge = np.count_nonzero(is_huge)
-    kind = "<f8" if _are_doubles(words, num_huge and np.count_nonzero(is_huge[::2])) else "<f4"
+    num_huge = int(np.count_nonzero(is_huge))
+    num_huge_lower = int(np.count_nonzero(is_huge[::2])) if num_huge else 0
+    kind = "<f8" if _are_doubles(words, num_huge_lower) else "<f4"
     size = np.dtype(kind).itemsize
     fitting = tuple(n for n in _COLUMNS[kind] if len(content) and len(content) % (size * n) == 0)
     layout = None
