@@ -75,7 +75,9 @@ def test_every_scan_id_needs_an_origin(bad):
 
 
 def test_rays_without_a_scan_id_need_an_origin_too():
-    with pytest.raises(ValueError, match="scan_id must be 0 to -1, one origin per scan; got 0 to 0"):
+    with pytest.raises(
+        ValueError, match="scan_id must be 0 to -1, one origin per scan; got 0 to 0"
+    ):
         Scans(torch.zeros(0, 3), torch.zeros(2, 3))
 
 
