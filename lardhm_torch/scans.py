@@ -57,11 +57,13 @@ class Scans:
                     f"{name} must be ({rays},), one entry per ray; got {tuple(value.shape)}"
                 )
             object.__setattr__(self, name, value)
-        if not is_checked and (self.scan_id.min() < 0 or self.scan_id.max() >= len(origins)):
-            raise ValueError(
-                f"scan_id must be 0 to {len(origins) - 1}, one origin per scan; "
-                f"got {int(self.scan_id.min())} to {int(self.scan_id.max())}"
-            )
+        if not is_checked:
+            lowest, highest = map(int, self.scan_id.aminmax())
+            if lowest < 0 or highest >= len(origins):
+                raise ValueError(
+                    f"scan_id must be 0 to {len(origins) - 1}, one origin per scan; "
+                    f"got {lowest} to {highest}"
+                )
         object.__setattr__(self, "origins", origins)
         object.__setattr__(self, "ends", ends)
 

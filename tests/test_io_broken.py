@@ -82,6 +82,12 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path, name):
         ("a.ply", "ply\nelement vertex 1\nend_header\n", "needs a line 'format'"),
         ("a.ply", "ply\nformat ebcdic 1.0\n", "line 2 of the header is not understood"),
         ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "element vertex is needed; got none"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement strip 2147483647\nproperty int i\nelement vertex 1\n"
+            "property float x\nproperty list uchar int seen\nend_header\n1\n2 0\n",
+            "element strip needs 2147483647 lines; 6 bytes are too few",
+        ),
         ("a.ply", "ply\nelement vertex -1\n", "element vertex must be a count; got '-1'"),
         (
             "a.ply",

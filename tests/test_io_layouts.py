@@ -61,6 +61,17 @@ def test_a_bin_file_of_another_layout_is_recognized_by_its_values(tmp_path, kind
         load_scans(tmp_path, strict=True)
 
 
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_points_that_are_not_finite_do_not_hide_the_layout(tmp_path, columns, bad):
+    points = sensor_points()
+    rows = with_columns(points, columns, 3).astype("<f4")
+    rows[::3, :3] = bad
+    rows.tofile(tmp_path / "a.bin")
+    read = load_points(tmp_path / "a.bin")
+    np.testing.assert_array_equal(read, rows[:, :3].astype(np.float64))
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.01, 100.0])
 @pytest.mark.parametrize("fourth", ["intensity", "zeros", "index"])
 def test_kitti_files_are_read_as_ever(tmp_path, scale, fourth):

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -142,6 +143,21 @@ def test_only_16_bit_images_of_some_size_are_depth(tmp_path):
     write_depth_images(tmp_path, np.zeros((2, 4, 4)), turning_poses(2))
     with pytest.raises(ValueError, match="at least one pixel with a depth is needed"):
         load_scans(tmp_path)
+
+
+def test_a_chunk_of_an_image_takes_no_more_memory_than_the_file(tmp_path):
+    path = write_depth_images(tmp_path, some_images(), turning_poses(2))
+    content = bytearray(path.read_bytes())
+    at = content.index(b"IDAT") - 4
+    content[at : at + 4] = (1 << 30).to_bytes(4, "big")
+    whole = load_scans(tmp_path)
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        np.testing.assert_array_equal(load_scans(tmp_path).ends, whole.ends)  # Pillow tolerates it
+        assert tracemalloc.get_traced_memory()[1] < 1 << 27
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_camera_is_checked():

@@ -74,6 +74,13 @@ def test_every_scan_id_needs_an_origin(bad):
         Scans(torch.zeros(2, 3), torch.zeros(2, 3), torch.tensor([0, bad]))
 
 
+def test_rays_without_a_scan_id_need_an_origin_too():
+    with pytest.raises(
+        ValueError, match="scan_id must be 0 to -1, one origin per scan; got 0 to 0"
+    ):
+        Scans(torch.zeros(0, 3), torch.zeros(2, 3))
+
+
 def test_selected_rays_keep_their_origin_and_columns():
     scans = random_scans(50)
     rays = torch.tensor([7, 3, 3, 49])

@@ -38,12 +38,16 @@ def find_layout(content: NDArray[np.uint8], is_nuscenes: bool = False) -> Layout
     probe = content[:_PROBED_BYTES]
     words = probe[: len(probe) // 8 * 8].view("<u4")
     exponents = words & _EXPONENT
-    is_huge = (exponents > _HUGE) & (exponents < _EXPONENT)
-    kind = "<f8" if _are_doubles(words, is_huge) else "<f4"
+    is_huge = exponents > _HUGE
+    if np.count_nonzero(is_huge):
+        is_huge &= exponents < _EXPONENT
+    num_huge = int(np.count_nonzero(is_huge))
+    num_huge_lower = int(np.count_nonzero(is_huge[::2])) if num_huge else 0
+    kind = "<f8" if _are_doubles(words, num_huge_lower) else "<f4"
     size = np.dtype(kind).itemsize
     fitting = tuple(n for n in _COLUMNS[kind] if len(content) and len(content) % (size * n) == 0)
     layout = None
-    if fitting and (kind == "<f8" or not _are_wild(words, exponents, is_huge)):
+    if fitting and (kind == "<f8" or not _are_wild(words, exponents, num_huge)):
         layout = _layout_of(probe.view(kind), kind, fitting, is_nuscenes)
     if layout is None:
         raise ValueError(
@@ -68,8 +72,8 @@ def _layout_of(
     if is_nuscenes and kind == "<f4" and scores.get(5, np.inf) < least + _CLEARLY:
         return NUSCENES
     if is_kitti_size and scores[4] <= least + _CLEARLY:
-        is_negative = values.reshape(-1, 4)[:, 3] < 0
-        if scores.get(3, np.inf) < scores[4] + _CLEARLY and is_negative.any():
+        may_be_three = scores.get(3, np.inf) < scores[4] + _CLEARLY
+        if may_be_three and (values.reshape(-1, 4)[:, 3] < 0).any():
             raise ValueError(
                 "it may have three columns (x y z) or four of float32: a fourth one would have the "
                 "values of coordinates. Convert the file to .npz, .pcd or .csv"
@@ -79,40 +83,38 @@ def _layout_of(
     return kind, next(n for n in fitting if scores[n] <= least + _CLEARLY / 2)
 
 
-def _are_doubles(words: NDArray[np.uint32], is_huge: NDArray[np.bool_]) -> bool:
+def _are_doubles(words: NDArray[np.uint32], num_huge_lower: int) -> bool:
     """Whether two words each are a double: the lower one is noise, or zero where floats end."""
     lower, upper = words[::2], words[1::2]
     num_coarse = len(lower) - np.count_nonzero(lower & 0x1FFFFFFF)
     is_coarse = num_coarse > 0.9 * len(lower) and (upper & 0x1FFFFFFF).any()
-    if not is_coarse and np.count_nonzero(is_huge[::2]) <= 0.005 * len(lower):
+    if not is_coarse and num_huge_lower <= 0.005 * len(lower):
         return False
     exponents = (upper >> 20) & 0x7FF
     return bool(((exponents <= 1023 + 63) | (exponents == 0x7FF)).mean() > 0.99)
 
 
-def _are_wild(
-    words: NDArray[np.uint32], exponents: NDArray[np.uint32], is_huge: NDArray[np.bool_]
-) -> bool:
+def _are_wild(words: NDArray[np.uint32], exponents: NDArray[np.uint32], num_huge: int) -> bool:
     """Whether too many floats are no coordinates, intensities or times."""
     num_tiny = np.count_nonzero(exponents < _TINY)
     if num_tiny > 0.35 * len(words):
         num_tiny -= len(words) - np.count_nonzero(words & ~_SIGN)  # zeros are none
-    return bool(num_tiny > 0.35 * len(words) or np.count_nonzero(is_huge) > 0.05 * len(words))
+    return bool(num_tiny > 0.35 * len(words) or num_huge > 0.05 * len(words))
 
 
 def _mean_log_variances(values: NDArray, numbers: tuple[int, ...]) -> dict[int, float]:
     """How much the columns vary, for each number of columns; infinite without finite values."""
     column_of, mean_of = _columns_of(numbers)
-    is_finite = np.isfinite(values)
     parts = np.empty((3, len(values)))
-    parts[0], parts[1] = is_finite, values
-    all_finite = is_finite.all()
+    parts[0], parts[1] = 1.0, values
+    all_finite = math.isfinite(parts[1] @ parts[1])
     if not all_finite:
-        parts[1, ~is_finite] = 0.0
+        parts[0] = np.isfinite(values)
+        parts[1, parts[0] == 0] = 0.0
     np.square(parts[1], out=parts[2])
     cycles = parts.reshape(3, -1, len(column_of))
     count, total, squares = (np.ones(cycles.shape[1]) @ cycles) @ column_of
-    known = np.maximum(count, 1.0)
+    known = count if all_finite else np.maximum(count, 1.0)
     logs = np.log(np.maximum(squares / known - (total / known) ** 2, 0.0) + 1e-6)
     means = logs @ mean_of
     if not all_finite:

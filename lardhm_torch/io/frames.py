@@ -89,7 +89,7 @@ def moved(readout: Readout, pose: FoundPose) -> Readout:
     return replace(
         readout,
         ends=move_points(pose.world_from_sensor, readout.ends),
-        origins=np.tile(pose.world_from_sensor[:3, 3], (readout.num_scans, 1)),
+        origins=np.full((readout.num_scans, 3), pose.world_from_sensor[:3, 3]),
         origin_is_placeholder=False,
         notes=(*readout.notes, *pose.notes, Note("points in the sensor frame, moved by the pose")),
     )

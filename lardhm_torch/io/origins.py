@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -133,7 +134,7 @@ def unused_origin(origin: Sequence[float], files: Sequence[Path]) -> ValueError:
 
 def note_not_finite(readout: Readout) -> Readout:
     """The readout with a note of how many ends are NaN or infinite: sampling drops these rays."""
-    if np.isfinite(readout.ends.sum()):  # takes no memory
+    if math.isfinite(readout.ends.sum()):  # takes no memory
         return readout
     count = int((~np.isfinite(readout.ends).all(axis=1)).sum())
     return readout.noting(

@@ -64,19 +64,20 @@ def read_pcd(path: Path) -> Readout:
     with open(path, "rb") as file:
         header = _read_header(file)
         readout = readout_from_columns(_read_body(path, file, header))
-    readout = replace(readout, grid=header.grid)
     if readout.origins is not None or header.viewpoint is None:
-        return replace(readout, origin_cure=_CURE)
+        return replace(readout, grid=header.grid, origin_cure=_CURE)
     position = np.array(header.viewpoint[: readout.dim])
     is_placeholder = not any(header.viewpoint[:3]) and _turns_nothing(header.viewpoint)
-    known = replace(
+    said = () if is_placeholder else (Note("sensor position from VIEWPOINT"),)
+    return replace(
         readout,
         origins=np.tile(position, (readout.num_scans, 1)),
         world_from_sensor=None if is_placeholder else _pose(header.viewpoint),
         origin_is_placeholder=is_placeholder,
         origin_cure=_CURE,
+        notes=(*readout.notes, *said),
+        grid=header.grid,
     )
-    return known if is_placeholder else known.noting(Note("sensor position from VIEWPOINT"))
 
 
 def _turns_nothing(viewpoint: list[float]) -> bool:

@@ -124,6 +124,11 @@ def _read_vertices(
         skip_lines += element.count
         if header.encoding != "ascii":
             _skip_binary(file, element)
+        elif skip_lines - header.num_lines > bytes_left(file):
+            raise ValueError(
+                f"element {element.name} needs {element.count} lines; "
+                f"{bytes_left(file)} bytes are too few"
+            )
     found = ", ".join(element.name for element in header.elements)
     raise ValueError(f"an element vertex is needed; got {found or 'none'}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,15 +55,22 @@ class _Matched:
 
 def find_beside(path: Path, names: tuple[str, ...]) -> Path | None:
     """The first of some files that lies beside path or one folder up; None if there is none."""
-    for folder in _folders_of(path):
+    beside = _find_in(_folders_of(path), names)
+    return None if beside is None else Path(beside)
+
+
+def _find_in(folders: tuple[str, str], names: tuple[str, ...]) -> str | None:
+    """The first of some files that is there; with strings, which is faster for many small scans."""
+    for folder in folders:
         for name in names:
-            if os.path.isfile(beside := os.path.join(folder, name)):
-                return Path(beside)
+            beside = os.path.join(folder, name)
+            if os.access(beside, os.F_OK) and os.path.isfile(beside):  # the former is faster
+                return beside
     return None
 
 
-def _folders_of(path: Path) -> tuple[str, str]:
-    """The folder of a file and the one above, as strings: faster for each of many small scans."""
+def _folders_of(path: Path | str) -> tuple[str, str]:
+    """The folder of a file and the one above."""
     folder = os.path.dirname(path) or "."
     return folder, os.path.dirname(folder) or "."
 
@@ -86,25 +94,25 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
     Raises:
         ValueError: the pose file is broken, fits no scan, or needs a calibration that is not there.
     """
-    source = find_beside(path, POSE_FILES)
+    places = _folders_of(path)
+    source = _find_in(places, POSE_FILES)
     if source is None:
         return None
     if poses_frame not in (None, "camera", "lidar"):
         raise ValueError(
             f'poses_frame must be "camera" or "lidar" beside {source}; got {poses_frame!r}'
         )
-    places = _folders_of(path)
     folders = tuple(map(_changed, (*places, _folders_of(source)[1])))
-    files = (str(source), *_calibrations(places[0], str(source), folders))
+    files = (source, *_calibrations(places[0], source, folders))
     stamps = (*folders, *map(_changed, files))
     suffix = path.suffix.lower()
-    matched = _pose_of_each(places[0], suffix, str(source), poses_frame, stamps)
+    matched = _pose_of_each(places[0], suffix, source, poses_frame, stamps)
     pose = matched.poses[path.name]
     is_first = path.name == next(iter(matched.poses))
     notes = matched.notes if is_first else matched.notes_of_others
-    if np.isfinite(pose).all():
+    if math.isfinite(pose.sum()):
         return FoundPose(pose, notes)
-    lost = Note(f"scans left out: {source.name} has no pose for them", 1, is_loss=True)
+    lost = Note(f"scans left out: {os.path.basename(source)} has no pose for them", 1, is_loss=True)
     return FoundPose(None, (lost, *notes))
 
 

@@ -81,7 +81,7 @@ class Readout:
 def rows_at_zero(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(R,) whether all coordinates of a point are 0; by columns, which is the fastest."""
     is_zero = points[:, 0] == 0
-    for axis in range(1, points.shape[1] if is_zero.any() else 1):
+    for axis in range(1, points.shape[1] if np.count_nonzero(is_zero) else 1):
         is_zero &= points[:, axis] == 0
     return is_zero
 

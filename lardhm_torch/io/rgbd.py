@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -253,7 +254,8 @@ def _read_depth(path: Path) -> NDArray[np.float64]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(path, formats=["PNG"])
+            # From memory: of a file Pillow would allocate whatever length a broken chunk promises.
+            image = Image.open(BytesIO(path.read_bytes()), formats=["PNG"])
         with image:
             if image.width * image.height > _MAX_PIXELS or not image.mode.startswith("I"):
                 raise ValueError(
