@@ -154,10 +154,11 @@ class LardHilbertMap(parameters.MapParameters):
             directions: (R, D) unit vectors, float64.
             march: parameters of `native.raycast`.
         """
-        if len(self) == 0 or not native.supports(self.centers):
+        found = self.native_map()
+        if found is None:
             return None
-        rays, tensors = (origins - self.origin, directions), self._tensors()[:3]
-        return native.raycast(rays, march, tensors, self.kernel, self._fresh_index())
+        rays = (origins - self.origin, directions)
+        return native.raycast(rays, march, found[:3], found.kernel, found.center_index)
 
     def _query(self, points: TensorLike, probability: bool) -> Tensor:
         local = self._to_map_frame(points)

@@ -129,6 +129,15 @@ def native_lattice(model: OccupancyMap, axes: list[Tensor], probability: bool) -
     return model.query_lattice(axes, probability=probability)
 
 
+def stored_moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+    """(M,) class and counts, (M, D) means and (M, D, D) scatters of the clusters; None if not stored."""
+    if not hasattr(model, "scatters"):
+        return None
+    names = ("is_occupied", "counts", "means", "scatters")
+    is_occupied, counts, means, scatters = (getattr(model, name) for name in names)
+    return is_occupied, counts, means, scatters
+
+
 def native_map(model: OccupancyMap) -> NativeMap | None:
     """The tensors of the map for `native.surfaces` by its ``native_map``; None if not available."""
     return model.native_map() if hasattr(model, "native_map") else None

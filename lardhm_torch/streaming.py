@@ -29,7 +29,9 @@ from lardhm_torch.scans import Scans
 class StreamConfig:
     """Settings of incremental mapping."""
 
-    num_clusters: int | None = None  # per scan of an unmapped place; None: chosen from the data
+    num_clusters: int | None = (
+        None  # of the first scan, and the most near a later one; None: chosen
+    )
     max_clusters: int | None = None  # upper bound on num_clusters; None: no limit
     max_rays: int | None = None  # per scan, drawn at random; None: all
     radius: float | None = None  # [m] clusters farther from the sensor are removed; None: keep all

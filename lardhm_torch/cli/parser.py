@@ -118,7 +118,7 @@ def _update(sub: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="map to write, which may be MAP itself; omit it for a tiled map, which is updated in place",
     )
-    _clusters(sub, "clusters of a scan of an unknown place (default: chosen from the data)")
+    _clusters(sub, "most clusters near a scan (default: chosen from the data)")
     _radius(sub)
     add_ranges(sub)
     _seed(sub)

@@ -1,4 +1,4 @@
-"""Matching, merging and appending of clusters (Algorithm 2)."""
+"""Matching and merging of clusters (Algorithm 2)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ def merge_clusters(
     where, groups = match[matched].unique(return_inverse=True)
     merged = pool_clusters(take_clusters(new, matched), groups, len(where))
     part = pool_into(known, where, merged, floor)
-    return append_clusters(part, take_clusters(new, fresh), is_occupied[fresh], floor)
+    added = new_rows(take_clusters(new, fresh), is_occupied[fresh], floor)
+    return part.put(match[:0], added)
 
 
 def take_clusters(clusters: Clusters, rows: Tensor) -> Clusters:
@@ -118,23 +119,3 @@ def moved_factors(raw_scale_tril: Tensor, before: Tensor, after: Tensor) -> Tens
     diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
     factors = raw_scale_tril.tril(-1) + torch.diag_embed(diagonal)
     return raw_factors(after @ torch.linalg.solve_triangular(before, factors, upper=False))
-
-
-def append_clusters(
-    known: MapState, new: Clusters, is_occupied: Tensor, floor: float, where: Tensor | None = None
-) -> MapState:
-    """Append new clusters with weight 0; the first ones replace the rows ``where``.
-
-    Clusters that replace a row keep the weight of that row.
-    """
-    where = known.counts[:0] if where is None else where
-    rows = new_rows(new, is_occupied, floor)
-    return known.put(
-        where,
-        replace(
-            rows,
-            weights=rows.weights.index_copy(
-                0, torch.arange(len(where), device=where.device), known.weights[where]
-            ),
-        ),
-    )

@@ -21,7 +21,7 @@ from lardhm_torch.points import morton_order
 POINTS_PER_CLUSTER = 15  # minimum mean number of points per cluster in `choose_num_clusters`
 DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the noise
 CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] grid cells, and occupied cells per cluster
-CELLS_PER_SCAN_CLUSTER = 1  # the same in updates: finer, because more scans will follow
+CELLS_PER_SCAN_CLUSTER = 1  # the same in `scan_clusters`
 MAX_CHOSEN = 5000  # upper bound per class in `choose_num_clusters`
 START_POINTS = 50  # number of random points per center from which initial centers are chosen
 ITERATIONS = 20  # of k-means; t in Algorithm 1
@@ -204,11 +204,10 @@ def split_clusters(class_sizes: list[int], num_clusters: int) -> list[int]:
 
 
 def scan_clusters(classes: list[Tensor]) -> list[int]:
-    """Number of clusters of each class for a scan of an unmapped place.
+    """Number of clusters of each class above which `StreamConfig.max_clusters` limits a scan.
 
-    This is the number given by `choose_num_clusters` with ``fine=True``, because later scans will
-    add points. Clusters have more than `POINTS_PER_CLUSTER` points only where points are so dense
-    that dozens of them lie in one cell.
+    This is the number given by `choose_num_clusters` with ``fine=True``. Clusters have more than
+    `POINTS_PER_CLUSTER` points only where points are so dense that dozens of them lie in one cell.
 
     Args:
         classes: (N, D) occupied and (F, D) free positions [m].

@@ -1,8 +1,9 @@
 """Forgetting: evidence that a new scan contradicts.
 
-A scan contradicts an occupied cluster if its free points outweigh its hits there, and a cluster of
-unknown points if it has any point there. A contradicted cluster keeps a quarter of its evidence, however
-long it was observed before, so an obstacle that has been removed disappears after a few scans.
+Free points near the center of an occupied cluster raise its doubt, and a hit resets it. A cluster in
+doubt is contradicted, and so is a cluster of unknown points that the map predicts as free or occupied. A
+contradicted cluster keeps a quarter of its evidence, however long it was observed before, so an obstacle
+that has been removed disappears after a few scans.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ FEWEST = 3  # contradicted clusters that would keep fewer points keep none
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
 
 
-def doubted(known: MapState, points: Tensor, labels: Tensor, kernel: Kernel) -> Tensor:
+def doubted(
+    known: MapState, points: Tensor, labels: Tensor, kernel: Kernel, index: Tensor
+) -> Tensor:
     """(M,) free points at the center of each occupied cluster since its last hit.
 
     A point counts with its feature, which is 1 at the center of a cluster and falls to 0.
@@ -35,13 +38,13 @@ def doubted(known: MapState, points: Tensor, labels: Tensor, kernel: Kernel) -> 
         points: (N, D) new points [m].
         labels: (N,) 1 occupied, 0 free, 1/2 unknown.
         kernel: kernel settings of the map.
+        index: search index of the centers, see `native.build_index`.
     """
     seen = labels != UNKNOWN
     points, is_hit = points[seen], labels[seen] > UNKNOWN
     if len(known) == 0 or len(points) == 0:
         return known.doubts
     kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, NARROWEST))
-    index = native.build_index(known.centers, kernel.num_neighbors)
     indices, values = native.nearest_features(
         points, known.centers, known.raw_scale_tril, kernel, index
     )

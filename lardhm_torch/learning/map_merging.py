@@ -142,7 +142,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
 
     Clusters that match by Algorithm 2 are merged, with weights and centers averaged in proportion to
     their numbers of points; all other clusters are copied. Where the probability of the merged map
-    deviates from that of the given maps, its weights are trained on pseudo-samples drawn from both
+    deviates from that of the given maps, its weights are trained on the evidence of both
     maps. Maps that do not overlap are combined unchanged, and merging a map with itself does not
     change its probabilities. The posterior of the weights is discarded, because the two maps were
     calibrated apart (see `LardHilbertMap.fit_uncertainty`).
@@ -151,7 +151,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         first: a `LardHilbertMap`.
         second: another map with the same settings and world frame (see
             `LardHilbertMap.transform`).
-        seed: random seed of the pseudo-samples and the training.
+        seed: random seed of the training.
 
     Returns:
         A new map, in the frame of the first.

@@ -45,10 +45,10 @@ def retrained(
         config: passes, rates and regularizer.
         rng: random generator.
     """
-    index = native.build_index(state.centers, kernel.num_neighbors)
     changed = _stalest(state, limit)
     if not bool(changed.any()):
         return state
+    index = native.build_index(state.centers, kernel.num_neighbors)
     moving = changed | _neighbors(changed, state.centers, kernel.num_neighbors, index)
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
@@ -153,7 +153,8 @@ def balanced(kinds: Tensor, strength: Tensor, config: FitConfig) -> Tensor:
     """(N,) loss factors, mean 1: sample weights within a class, and classes balanced as in `fit`."""
     labels = KIND_LABELS.to(strength)[kinds]
     shares = label_factors(labels, config.occupied_share, config.unknown_share).to(strength)
+    shares = shares[[2, 0, 1]]  # from the order of the labels to that of the kinds
     means = torch.zeros_like(shares).index_add_(0, kinds, strength)
     means /= torch.bincount(kinds, minlength=3).clamp(min=1)
-    factors = strength * (shares.flip(0)[[0, 2, 1]] / means)[kinds]
+    factors = strength * (shares / means)[kinds]
     return factors / factors.mean()

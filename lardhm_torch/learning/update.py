@@ -77,8 +77,8 @@ def updated(
 ) -> Changes:
     """Update clusters and weights with one more scan.
 
-    Only clusters near the points are processed, so the cost does not grow with the map. Existing
-    clusters keep their rows, and new clusters are appended.
+    Only clusters near the points are processed. Existing clusters keep their rows, unless they are
+    dissolved.
 
     Args:
         state: M clusters.
@@ -101,10 +101,11 @@ def updated(
     part = replace(part, evidence=with_evidence(part, kernel.min_lengthscale, rng))
     if config.as_in_paper:
         return Changes(nearby, _as_in_paper(part, points, labels, num_clusters, task), nearby[:0])
+    index = native.build_index(part.centers, kernel.num_neighbors)
     few = int(state.counts[state.is_occupied].sum() + (labels > UNKNOWN).sum()) <= FEW_POINTS
     points, labels = _thinned(points, labels, config.max_points, rng)
-    points, labels = _still_unknown(part, points, labels, kernel)
-    part = replace(part, doubts=doubted(part, points, labels, kernel))
+    points, labels = _still_unknown(part, points, labels, kernel, index)
+    part = replace(part, doubts=doubted(part, points, labels, kernel, index))
     lost = contradicted(part)
     part = _regrouped(forget(part, lost), points, labels, num_clusters, few, task)
     alive = kept_counts(part.evidence) > 0
@@ -140,7 +141,7 @@ def _thinned(
 
 
 def _still_unknown(
-    part: MapState, points: Tensor, labels: Tensor, kernel: Kernel
+    part: MapState, points: Tensor, labels: Tensor, kernel: Kernel, index: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The samples without unknown points in places that earlier scans observed.
 
@@ -151,7 +152,7 @@ def _still_unknown(
     if len(rows) == 0 or len(part) == 0:
         return points, labels
     tensors = (part.centers, part.raw_scale_tril, part.weights, kernel)
-    probability = native.occupancy(points[rows], *tensors, probability=True)
+    probability = native.occupancy(points[rows], *tensors, probability=True, index=index)
     kept = torch.ones_like(labels, dtype=torch.bool)
     kept[rows] = (probability - UNKNOWN).abs() < UNDECIDED
     return points[kept], labels[kept]

@@ -40,19 +40,14 @@ struct TreeSections {
   int64_t order, leaves, boxes[kMostLevels], end;
 
   explicit TreeSections(const TreeHeader& h) {
-    int64_t at = sizeof(TreeHeader);
-    auto section = [&at](int64_t bytes) {
-      const int64_t begin = padded(at, 64);
-      at = begin + bytes;
-      return begin;
-    };
+    Cursor section{sizeof(TreeHeader)};
     const int64_t count = padded(h.faces, kFan);
     const int face = h.dim == 3 ? FaceLayout<3>::count : FaceLayout<2>::count;
     order = section(count * 4);
     leaves = section(count * face * 4);
     for (int64_t level = 0; level < h.levels; ++level)
       boxes[level] = section(h.nodes[level] * kFan * h.dim * 2 * 4);
-    end = padded(at, 64);
+    end = padded(section.at, 64);
   }
 };
 

@@ -37,16 +37,22 @@ inline uint64_t checksum(Header header) {
 
 inline int64_t padded(int64_t count, int64_t to) { return (count + to - 1) / to * to; }
 
+// Sections of a buffer after its header, one after the other, each aligned to 64 bytes.
+struct Cursor {
+  int64_t at;
+
+  int64_t operator()(int64_t bytes) {
+    const int64_t begin = padded(at, 64);
+    at = begin + bytes;
+    return begin;
+  }
+};
+
 struct Sections {
   int64_t blocks, tiles, centers, order, relative, boxes, tile_boxes, end;
 
   explicit Sections(const Header& h) {
-    int64_t at = sizeof(Header);
-    auto section = [&at](int64_t bytes) {
-      const int64_t begin = padded(at, 64);
-      at = begin + bytes;
-      return begin;
-    };
+    Cursor section{sizeof(Header)};
     blocks = padded(h.count, kBlock) / kBlock;
     tiles = padded(blocks, kBlock) / kBlock;
     centers = section(h.count * h.dim * h.item_size);
@@ -54,7 +60,7 @@ struct Sections {
     relative = section(blocks * kBlock * h.dim * 4);
     boxes = section(tiles * kBlock * h.dim * 2 * 4);
     tile_boxes = section(padded(tiles, kBlock) * h.dim * 2 * 4);
-    end = padded(at, 64);
+    end = padded(section.at, 64);
   }
 };
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.maps import OccupancyMap, covariance_scale, num_neighbors
+from lardhm_torch.maps import OccupancyMap, covariance_scale, num_neighbors, stored_moments
 from lardhm_torch.queries.grids import EVIDENCE
 
 EDGE = math.sqrt(3)  # half edge of a uniform distribution, in standard deviations
@@ -93,21 +93,16 @@ def kernel_tensors(model: OccupancyMap) -> tuple[Tensor, ...]:
 
 def _source(model: OccupancyMap) -> tuple[Tensor, ...]:
     """Everything that the plates are made from: `kernel_tensors`, and the hits' moments if stored."""
-    if not hasattr(model, "scatters"):
-        return kernel_tensors(model)
-    names = ("is_occupied", "counts", "means", "scatters")
-    return *kernel_tensors(model), *(getattr(model, name) for name in names)
+    return *kernel_tensors(model), *(stored_moments(model) or ())
 
 
 def _moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor]:
     """(M,) whether a cluster is one of hits, their (M, D) means and (M, D, D) covariances."""
-    if hasattr(model, "scatters"):
-        counts = model.counts.clamp(min=1).to(model.means.dtype)  # type: ignore[attr-defined]
-        return (
-            model.is_occupied & (model.counts > 0),  # type: ignore[attr-defined]
-            model.means,  # type: ignore[attr-defined]
-            model.scatters / counts[:, None, None],  # type: ignore[attr-defined]
-        )
+    stored = stored_moments(model)
+    if stored is not None:
+        is_occupied, counts, means, scatters = stored
+        sizes = counts.clamp(min=1).to(means.dtype)
+        return is_occupied & (counts > 0), means, scatters / sizes[:, None, None]
     factors = model.scale_tril.detach()
     return (
         model.weights.detach() > 0,
