@@ -192,7 +192,8 @@ class LardHilbertMap(parameters.MapParameters):
 
     def _fresh_index(self) -> Tensor:
         """Index of the neighbor search. It is rebuilt if the centers have changed."""
-        if torch.compiler.is_compiling():  # the operators check the index themselves
+        # The operators check the index themselves; the transforms of torch.func do not use it.
+        if torch.compiler.is_compiling() or native.transformed():
             return self._index
         if not native.index_matches(self._index, self.centers, self.num_neighbors):
             with torch.inference_mode(False):  # inference tensors cannot be used in training

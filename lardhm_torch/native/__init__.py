@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from lardhm_torch import features
 from lardhm_torch.features import Kernel
@@ -35,10 +36,23 @@ def available() -> bool:
     return True
 
 
-def supports(points: Tensor) -> bool:
-    """Whether the kernel answers for (N, D) points of this device, dtype and dimension."""
+def supports(*tensors: Tensor) -> bool:
+    """Whether the kernel answers for tensors like these; the first is (N, D).
+
+    It does for some devices, dtypes and dimensions, but not inside the transforms of `torch.func` nor
+    for the dual tensors of forward-mode differentiation.
+    """
+    points = tensors[0]
     fits = points.device.type == "cpu" and points.dtype in DTYPES
-    return fits and points.shape[-1] in DIMENSIONS and available()
+    return fits and points.shape[-1] in DIMENSIONS and available() and not transformed(*tensors)
+
+
+def transformed(*tensors: Tensor) -> bool:
+    """Whether a transform of `torch.func` is active, or one of the tensors is dual."""
+    # Only the definition knows how to batch itself and how to push tangents forward.
+    if torch._C._are_functorch_transforms_active():
+        return True
+    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
 def build_index(centers: Tensor, num_neighbors: int) -> Tensor:
@@ -79,7 +93,7 @@ def occupancy(
 
     An index saves the time to make one.
     """
-    if not supports(points):
+    if not supports(points, centers, raw_scale_tril, weights):
         factors = features.kernel_factors(raw_scale_tril, kernel)
         answer = features.log_odds(points, centers, factors, weights, kernel.num_neighbors)
         return torch.sigmoid(answer) if probability else answer
