@@ -43,7 +43,11 @@ def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
 
     Raises:
         FileNotFoundError: the folder of path does not exist.
+        ValueError: a tensor is on the meta device, and has no values.
     """
+    empty = [name for name, value in state.items() if isinstance(value, Tensor) and value.is_meta]
+    if empty:
+        raise ValueError(f"{empty[0]} must have values to be saved; it is on the meta device")
     with replaced_file(path) as partial:
         if _is_safetensors(path):
             _write_safetensors(state, partial)

@@ -51,6 +51,8 @@ def build_index(centers: Tensor, num_neighbors: int) -> Tensor:
 
 def index_matches(index: Tensor, centers: Tensor, num_neighbors: int) -> bool:
     """Whether an index was made from exactly these centers."""
+    if index.device != centers.device:
+        return False
     if not supports(centers):
         return len(index) == 0
     return torch.ops.lardhm.index_matches(index, centers.detach(), num_neighbors)
