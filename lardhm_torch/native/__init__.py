@@ -82,12 +82,11 @@ def occupancy(
 
     An index saves the time to make one.
     """
-    if not supports(points, centers, raw_scale_tril, weights):
-        return definition(points, centers, raw_scale_tril, weights, kernel, probability)
+    tensors = (points, centers, raw_scale_tril, weights)
+    if not supports(*tensors):
+        return definition(tensors, kernel, probability)
     index = build_index(centers, kernel.num_neighbors) if index is None else index
-    return torch.ops.lardhm.occupancy(
-        points, centers, raw_scale_tril, weights, *kernel, index, probability
-    )
+    return torch.ops.lardhm.occupancy(*tensors, *kernel, index, probability)
 
 
 def lattice_occupancy(

@@ -8,6 +8,7 @@ the definition in `features`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -42,9 +43,9 @@ def transformed(*tensors: Tensor) -> bool:
     return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
-def definition(points: Tensor, centers: Tensor, raw_scale_tril: Tensor, weights: Tensor,
-               kernel: Kernel, probability: bool) -> Tensor:  # fmt: skip
-    """`features.log_odds` of `features.kernel_factors`, or its sigmoid."""
+def definition(tensors: Sequence[Tensor], kernel: Kernel, probability: bool) -> Tensor:
+    """`features.log_odds` of points, centers, raw factors and weights, or its sigmoid."""
+    points, centers, raw_scale_tril, weights = tensors
     factors = features.kernel_factors(raw_scale_tril, kernel)
     answer = features.log_odds(points, centers, factors, weights, kernel.num_neighbors)
     return torch.sigmoid(answer) if probability else answer
@@ -54,7 +55,7 @@ def _without_library(points: Tensor, *arguments: Any) -> Tensor:
     if fits(points) and available():  # once: the library that this loads serves all later calls
         return torch.ops.lardhm.occupancy(points, *arguments)
     *parameters, k, scale, floor, _, probability = arguments
-    return definition(points, *parameters, Kernel(k, scale, floor), probability)
+    return definition([points, *parameters], Kernel(k, scale, floor), probability)
 
 
 @torch.library.register_fake(NAME)
@@ -66,7 +67,7 @@ def _autograd(keys: torch._C.DispatchKeySet, *arguments: Any) -> Tensor:
     tensors, settings = arguments[:4], arguments[4:]
     if transformed(*tensors):
         *kernel, _, probability = settings
-        return definition(*tensors, Kernel(*kernel), probability)
+        return definition(tensors, Kernel(*kernel), probability)
     return _Occupancy.apply(keys, *arguments)
 
 
@@ -106,7 +107,7 @@ def _gradients_of_definition(
     """Gradients that can be differentiated again."""
     again = torch.is_grad_enabled()
     with torch.enable_grad():
-        answer = definition(*inputs, kernel, probability)
+        answer = definition(inputs, kernel, probability)
         asked = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
         found = iter(torch.autograd.grad(answer, asked, grad, create_graph=again))
     return [next(found) if need else None for need in needed]
