@@ -15,6 +15,7 @@ from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.changes import normal_tensors
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, no_evidence
+from lardhm_torch.learning.state_checks import check_settings, check_values
 
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
 HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
@@ -255,6 +256,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
                 f"got {tuple(state[prefix + name].shape)}"
             )
+    check_values({name: state[prefix + name] for name in own})
     resize(model, num_clusters)
 
 
@@ -376,17 +378,3 @@ def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> 
                 )
             room = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
             optimizer.state[parameter][name] = torch.cat([value, room])
-
-
-def check_settings(
-    dim: int, num_neighbors: int, covariance_scale: float, min_lengthscale: float
-) -> None:
-    """Raise a ValueError if a setting of a map is out of range."""
-    for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
-    if not covariance_scale > 0 or not min_lengthscale > 0:
-        raise ValueError(
-            "covariance_scale and min_lengthscale must be > 0; "
-            f"got {covariance_scale} and {min_lengthscale}"
-        )
