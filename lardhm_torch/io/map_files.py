@@ -139,6 +139,8 @@ def _write_torch(state: Mapping[str, Any], path: Path) -> None:
     try:
         with open(path, "wb") as file:
             torch.save(compact, file)
+    except RuntimeError as error:  # torch's own after a failed write, as on a full disk
+        raise error.__context__ if isinstance(error.__context__, OSError) else error from None
     finally:
         torch.serialization.set_crc32_options(with_checksums)
 
