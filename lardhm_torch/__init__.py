@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from lardhm_torch.operator_import import define_operators
-
 if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the table below
     from lardhm_torch.evaluation.held_out import evaluate as evaluate
     from lardhm_torch.hilbert_map import LardHilbertMap as LardHilbertMap
@@ -97,7 +95,7 @@ _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names
 __all__ = sorted(_MODULE_OF)
 
 
-define_operators()
+importlib.import_module(f"{__name__}.operator_import").define_operators()
 
 
 def __getattr__(name: str) -> Any:
