@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from lardhm_torch import native
-from lardhm_torch.native import build
+from lardhm_torch.native import build, cache, compiling
 
 ROOT = Path(__file__).parents[1]
 
@@ -86,7 +86,7 @@ def test_a_killed_build_leaves_nothing_that_blocks_the_next(tmp_path, monkeypatc
     quick = stub_compiler(tmp_path, 'echo whole > "$target"')
     monkeypatch.setenv("CXX", str(quick))
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
-    library = build._cached_library()
+    library = build._compiled_library()
     assert library.read_text() == "whole\n"
     assert library.parent == tmp_path / "cache"
 
@@ -95,8 +95,8 @@ def test_an_unwritable_cache_is_replaced_by_a_temporary_folder(tmp_path, monkeyp
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv("CXX", str(stub_compiler(tmp_path, 'echo whole > "$target"')))
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(build.tempfile, "gettempdir", lambda: str(tmp_path))
-    library = build._cached_library()
+    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    library = build._compiled_library()
     assert library.read_text() == "whole\n"
     assert tmp_path in library.parents
 
@@ -106,7 +106,7 @@ def test_two_builds_at_once_both_succeed(tmp_path, monkeypatch):
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
     built: list[Path] = []
     threads = [
-        threading.Thread(target=lambda: built.append(build._cached_library())) for _ in range(2)
+        threading.Thread(target=lambda: built.append(build._compiled_library())) for _ in range(2)
     ]
     for thread in threads:
         thread.start()
@@ -119,11 +119,11 @@ def test_two_builds_at_once_both_succeed(tmp_path, monkeypatch):
 
 
 def test_a_damaged_library_in_the_cache_is_built_anew(ops, tmp_path, monkeypatch):
-    sound = build._cached_library()
+    sound = build._compiled_library()
     compiler = stub_compiler(tmp_path, f'cp "{sound}" "$target"')
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
-    damaged = build._cached_library()
+    damaged = build._compiled_library()
     damaged.write_bytes(b"no library")
     environment = {"CXX": str(compiler), "LARDHM_CACHE": str(tmp_path / "cache")}
     assert ask_in_process(LARDHM_NATIVE="1", **environment) == "True 0"
@@ -131,14 +131,14 @@ def test_a_damaged_library_in_the_cache_is_built_anew(ops, tmp_path, monkeypatch
 
 
 def test_a_change_of_source_or_compiler_is_another_library(tmp_path, monkeypatch):
-    first = build._cache_key(["c++"])
-    assert first == build._cache_key(["c++"])
-    assert first != build._cache_key(["g++"])
-    changed = shutil.copytree(build.FOLDER, tmp_path / "native")
+    first = compiling.hash_build(["c++"])
+    assert first == compiling.hash_build(["c++"])
+    assert first != compiling.hash_build(["g++"])
+    changed = shutil.copytree(compiling.SOURCES, tmp_path / "native")
     with (changed / "index.h").open("a") as source:
         source.write("\n")
-    monkeypatch.setattr(build, "FOLDER", changed)
-    assert first != build._cache_key(["c++"])
+    monkeypatch.setattr(compiling, "SOURCES", changed)
+    assert first != compiling.hash_build(["c++"])
 
 
 def test_importing_the_package_builds_and_loads_nothing(tmp_path):
