@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from lardhm_torch import native
-from lardhm_torch.native import build, cache, compiling
+from lardhm_torch.native import build, compiling
 
 ROOT = Path(__file__).parents[1]
 
@@ -91,16 +91,6 @@ def test_a_killed_build_leaves_nothing_that_blocks_the_next(tmp_path, monkeypatc
     assert library.parent == tmp_path / "cache"
 
 
-def test_an_unwritable_cache_is_replaced_by_a_temporary_folder(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv("CXX", str(stub_compiler(tmp_path, 'echo whole > "$target"')))
-    monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
-    library = build._compiled_library()
-    assert library.read_text() == "whole\n"
-    assert tmp_path in library.parents
-
-
 def test_two_builds_at_once_both_succeed(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", str(stub_compiler(tmp_path, 'sleep 0.3; echo whole > "$target"')))
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
@@ -130,15 +120,25 @@ def test_a_damaged_library_in_the_cache_is_built_anew(ops, tmp_path, monkeypatch
     assert damaged.read_bytes() == sound.read_bytes()
 
 
-def test_a_change_of_source_or_compiler_is_another_library(tmp_path, monkeypatch):
-    first = compiling.hash_build(["c++"])
-    assert first == compiling.hash_build(["c++"])
-    assert first != compiling.hash_build(["g++"])
+def test_a_change_of_source_torch_compiler_or_processor_is_another_library(tmp_path, monkeypatch):
+    compiler = tmp_path / "c++"
+    compiler.write_text("version 1")
+    command = [str(compiler)]
+    names = [compiling.hash_build(command)]
+    assert compiling.hash_build(command) == names[0]
+    names.append(compiling.hash_build([*command, "-O1"]))
+    compiler.write_text("version 1.1")  # an update in place
+    names.append(compiling.hash_build(command))
+    monkeypatch.setattr(torch, "__version__", "2.99")
+    names.append(compiling.hash_build(command))
+    monkeypatch.setattr(compiling, "_processor", lambda: b"flags: sse2")
+    names.append(compiling.hash_build(command))
     changed = shutil.copytree(compiling.SOURCES, tmp_path / "native")
     with (changed / "index.h").open("a") as source:
         source.write("\n")
     monkeypatch.setattr(compiling, "SOURCES", changed)
-    assert first != compiling.hash_build(["c++"])
+    names.append(compiling.hash_build(command))
+    assert len(set(names)) == len(names)
 
 
 def test_importing_the_package_builds_and_loads_nothing(tmp_path):

@@ -1,11 +1,16 @@
 """Load the kernel: the library that a wheel ships, else one compiled for this machine, else none.
 
+- Linux on x86-64: the wheel for this platform ships the kernel; the pure wheel and the sources compile it.
+- Linux on other processors, macOS: it is compiled on first use.
+- Windows, and wherever there is no compiler: the plain path, with one warning.
+
 Two libraries register the same operators, so a process loads one of them at most.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import threading
 import warnings
@@ -15,12 +20,7 @@ from pathlib import Path
 import torch
 
 from lardhm_torch.native.cache import cached_file
-from lardhm_torch.native.compiling import (
-    CompileError,
-    compile_kernel,
-    find_compiler,
-    hash_build,
-)
+from lardhm_torch.native.compiling import compile_kernel, find_compiler, hash_build
 from lardhm_torch.native.shipped import shipped_library
 
 OFF = ("0", "false", "off", "no")
@@ -46,32 +46,41 @@ def available() -> bool:
 def _try_to_load() -> bool:
     if os.environ.get("LARDHM_NATIVE", "1").lower() in OFF:
         return False
+    problem = _load_shipped()
+    if problem is None:
+        return True
     try:
-        if not _load(shipped_library()):
-            library = _compiled_library()
-            if not _load(library):  # damaged in the cache: compile it anew, once
-                library.unlink(missing_ok=True)
-                torch.ops.load_library(str(_compiled_library()))
+        _load_compiled()
     except (OSError, RuntimeError, subprocess.SubprocessError) as error:
-        reason = " ".join(str(error).split())[:300]
+        reason = " ".join(f"{problem}, and {error}".split())[:400]
         warnings.warn(
             f"the native kernel is not available, maps answer several times slower: {reason}. "
-            "Install a C++ compiler, or set LARDHM_NATIVE=0 to silence this",
+            "LARDHM_NATIVE=0 silences this",
             stacklevel=4,
         )
         return False
     return True
 
 
-def _load(library: Path | None) -> bool:
-    """Whether a library could be loaded; if not, nothing of it is left in the process."""
+def _load_shipped() -> str | None:
+    """Load what the installation ships; why that is not possible, or None."""
+    library = shipped_library()
     if library is None:
-        return False
+        return f"no compiled kernel is installed for {platform.system()} on {platform.machine()}"
     try:
         torch.ops.load_library(str(library))
-    except OSError:
-        return False
-    return True
+    except OSError as error:
+        return f"the installed kernel does not load ({error})"
+    return None
+
+
+def _load_compiled() -> None:
+    library = _compiled_library()
+    try:
+        torch.ops.load_library(str(library))
+    except OSError:  # damaged in the cache: compile it anew, once
+        library.unlink(missing_ok=True)
+        torch.ops.load_library(str(_compiled_library()))
 
 
 def _compiled_library() -> Path:

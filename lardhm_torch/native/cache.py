@@ -6,14 +6,15 @@ there or replace the folder: its owner and mode and those of the folders above i
 
 from __future__ import annotations
 
+import atexit
+import functools
 import os
+import shutil
 import stat
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-
-_temporary: tempfile.TemporaryDirectory[str] | None = None  # removed when the process ends
 
 
 def cached_file(name: str, make: Callable[[Path], None]) -> Path:
@@ -63,7 +64,9 @@ def check_private(path: Path) -> None:
         above = place != path
         if status.st_uid not in (0, user):
             raise PermissionError(f"{place} belongs to another user (uid {status.st_uid})")
-        own_group = above and status.st_gid == user  # user private groups have the number of the user
+        own_group = (
+            above and status.st_gid == user
+        )  # user private groups have the number of the user
         writable = status.st_mode & (stat.S_IWOTH if own_group else stat.S_IWOTH | stat.S_IWGRP)
         if writable and not (above and status.st_mode & stat.S_ISVTX):
             raise PermissionError(f"other users can write to {place} (cure: chmod go-w {place})")
@@ -71,12 +74,18 @@ def check_private(path: Path) -> None:
 
 def _folders() -> Iterator[Path]:
     """The user's cache; a temporary folder that later processes find; one of this process alone."""
-    global _temporary
     named = os.environ.get("LARDHM_CACHE")
     yield Path(named) if named else Path.home() / ".cache" / "lardhm_torch"
     yield Path(tempfile.gettempdir()) / f"lardhm_torch-{os.getuid()}"
-    _temporary = _temporary or tempfile.TemporaryDirectory(prefix="lardhm_torch-")
-    yield Path(_temporary.name)
+    yield _process_folder()
+
+
+@functools.cache
+def _process_folder() -> Path:
+    """A new private folder, removed when the process ends."""
+    folder = tempfile.mkdtemp(prefix="lardhm_torch-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 def _make_in_one_step(target: Path, make: Callable[[Path], None]) -> None:

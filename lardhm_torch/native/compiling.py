@@ -21,7 +21,8 @@ FLAGS = (
     "-fno-trapping-math", "-fno-tree-slp-vectorize",  # packs neighbors through memory, and stalls
     "-fPIC", "-w", "-DTORCH_TARGET_VERSION=0x020a000000000000",
 )  # fmt: skip
-FOR_THIS_PROCESSOR = "-march=native"
+ARM = platform.machine() in ("aarch64", "arm64")
+FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
 # Sources that are compiled together, the longest job first. Torch's headers take a second a unit: the
 # last two do without.
 UNITS = (
@@ -44,13 +45,13 @@ def find_compiler() -> list[str]:
         CompileError: there is none, or the platform is not supported.
     """
     if sys.platform == "win32":
-        raise CompileError("it can be compiled on Linux and macOS only")
+        raise CompileError("it cannot be compiled on Windows")
     named = shlex.split(os.environ.get("CXX", ""))
     for program, *arguments in [named] if named else [[name] for name in COMPILERS]:
         if found := shutil.which(program):
             return [found, *arguments]
     looked_for = " ".join(named) or ", ".join(COMPILERS)
-    raise CompileError(f"no C++ compiler found (looked for {looked_for})")
+    raise CompileError(f"no C++ compiler was found (looked for {looked_for}): install one")
 
 
 def hash_sources() -> str:
@@ -83,7 +84,7 @@ def _compiler_version(program: str) -> bytes:
 
 
 def _processor() -> bytes:
-    """What -march=native depends on."""
+    """What `FOR_THIS_PROCESSOR` depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_bytes().split(b"\n")
     except OSError:

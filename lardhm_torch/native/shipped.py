@@ -12,12 +12,12 @@ from pathlib import Path
 from lardhm_torch.native.compiling import SOURCES, hash_sources
 
 FOLDER = SOURCES / "shipped"
-_V3 = frozenset("avx avx2 bmi1 bmi2 f16c fma abm movbe".split())
-# Levels of the x86-64 psABI, the highest first, and the processor's flags that each needs.
+_V3 = {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
+# Levels of the x86-64 psABI, the highest first, and the flags of the processor that each needs.
 LEVELS = {
-    "x86-64-v4": _V3 | frozenset("avx512f avx512bw avx512cd avx512dq avx512vl".split()),
+    "x86-64-v4": _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
     "x86-64-v3": _V3,
-    "x86-64": frozenset(),
+    "x86-64": set(),
 }
 
 
@@ -34,16 +34,16 @@ def library_name(level: str) -> str:
     return f"kernel-{level}-{hash_sources()}.so"
 
 
-def processor_level(flags: frozenset[str]) -> str:
+def processor_level(flags: set[str]) -> str:
     """The highest of `LEVELS` for a processor with these flags."""
     return next(level for level, needed in LEVELS.items() if needed <= flags)
 
 
-def processor_flags() -> frozenset[str]:
-    """What the processor can do and the kernel allows, in Linux' names; empty where unknown."""
+def processor_flags() -> set[str]:
+    """What the processor can do and the kernel allows, as Linux names it; empty where unknown."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
-        return frozenset()
+        return set()
     flags = next((line for line in lines if line.startswith("flags")), "")
-    return frozenset(flags.partition(":")[2].split())
+    return set(flags.partition(":")[2].split())
