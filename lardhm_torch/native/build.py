@@ -1,6 +1,6 @@
 """Load the kernel: the library that a wheel ships, else one compiled for this machine, else none.
 
-- Linux on x86-64: the wheel for this platform ships the kernel; the pure wheel and the sources compile it.
+- Linux on x86-64: the wheel for this platform ships the kernel; the pure wheel compiles it.
 - Linux on other processors, macOS: it is compiled on first use.
 - Windows, and wherever there is no compiler: the plain path, with one warning.
 

@@ -7,6 +7,7 @@ import json
 import platform
 import sys
 import tempfile
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,6 +27,7 @@ def check(holds: bool, what: str) -> None:
 
 def main(with_kernel: bool) -> None:
     """Run every part and print the versions as one line of JSON."""
+    warnings.filterwarnings("error", module="lardhm_torch")  # other packages' are theirs
     check(native.available() == with_kernel, f"the kernel is {'' if with_kernel else 'not '}loaded")
     scans = lh.simulate_room(num_rays=2000, seed=0)
     train, test = lh.split_rays(scans, ratio=0.8, seed=0)
