@@ -12,6 +12,7 @@ from pathlib import Path
 from lardhm_torch.native.compiling import SOURCES, hash_sources
 
 FOLDER = SOURCES / "shipped"
+CPUINFO = Path("/proc/cpuinfo")
 _V3 = {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
 # Levels of the x86-64 psABI, the highest first, and the flags of the processor that each needs.
 LEVELS = {
@@ -42,7 +43,7 @@ def processor_level(flags: set[str]) -> str:
 def processor_flags() -> set[str]:
     """What the processor can do and the kernel allows, as Linux names it; empty where unknown."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = CPUINFO.read_text().splitlines()
     except OSError:
         return set()
     flags = next((line for line in lines if line.startswith("flags")), "")
