@@ -31,6 +31,7 @@ UNITS = (
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
 )
+LONGEST = 1800  # [s] for one unit, on a slow and busy machine
 COMPILERS = ("c++", "g++", "clang++")
 
 
@@ -131,7 +132,7 @@ def _write_units(folder: Path) -> list[Path]:
 
 
 def _run(command: list[str], made: Path) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST)
     if done.returncode or not made.is_file():
         lines = [line for line in done.stderr.splitlines() if "error" in line] or ["no output"]
         raise CompileError(f"{command[0]} failed with exit code {done.returncode}: {lines[0]}")
