@@ -38,10 +38,10 @@ class Check(NamedTuple):
 
 CHECKS = {
     "memory": Check(
-        ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"),
+        ("-fsanitize=address,undefined",),
         ("libasan.so", "libubsan.so"),
         # Python frees little when it ends
-        {"ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "print_stacktrace=1"},
+        {"ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1"},
         NATIVE,
     ),
     "threads": Check(
