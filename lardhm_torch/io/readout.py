@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ class Readout:
         notes: what was assumed or left out.
         times: (R,) float64 when each ray was measured [s], in the clock of the file.
         grid: rows and columns of an organized cloud, whose rays come row by row.
+        channels: (R, ...) values of the rays by name, see `lardhm_torch.channels`.
     """
 
     ends: NDArray[np.float64]
@@ -44,6 +45,7 @@ class Readout:
     notes: tuple[Note, ...] = ()
     times: NDArray[np.float64] | None = None
     grid: tuple[int, int] | None = None
+    channels: Mapping[str, NDArray] = field(default_factory=dict)
 
     def noting(self, *notes: Note) -> Readout:
         """The same with more notes."""
@@ -54,7 +56,8 @@ class Readout:
         columns = ("ends", "scan_id", "is_return", "target_index", "times")
         values = {name: getattr(self, name) for name in columns}
         kept = {name: value[rays] for name, value in values.items() if value is not None}
-        return replace(self, **kept, grid=None)
+        channels = {name: values[rays] for name, values in self.channels.items()}
+        return replace(self, **kept, grid=None, channels=channels)
 
     @property
     def dim(self) -> int:
