@@ -250,3 +250,13 @@ def log_odds(
         total = (values * weights[indices]).sum(dim=1)
         chunks.append(total.where(chunk.isfinite().all(dim=1), total.new_tensor(torch.nan)))
     return torch.cat(chunks)
+
+
+def mixed_rows(indices: Tensor, values: Tensor, table: Tensor) -> Tensor:
+    """Sum of the rows of a table, weighted by features: (N, K) indices and values, (M, C) -> (N, C)."""
+    whole = torch.compiler.is_compiling() or values.requires_grad
+    if whole:  # differentiable in the values, twice, too
+        return (values[:, :, None] * table[indices]).sum(dim=1)
+    return torch.nn.functional.embedding_bag(
+        indices, table, per_sample_weights=values, mode="sum"
+    )

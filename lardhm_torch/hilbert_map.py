@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
-from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
+from lardhm_torch.channels import Channels, check_channels
 from lardhm_torch.io import map_files
-from lardhm_torch.learning import map_merging, parameters, posterior
+from lardhm_torch.learning import channel_sums, map_merging, parameters, posterior
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
+from lardhm_torch.learning.map_state import HISTORY
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
+from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.native.surfaces import NativeMap
-from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame, training_points
+from lardhm_torch.points import training_points
 from lardhm_torch.sampling import seeded_generator
 
 
-class LardHilbertMap(parameters.MapParameters):
+class LardHilbertMap(MapQueries):
     """Continuous occupancy map whose log-odds are a weighted sum of local kernel features.
 
     The probability is exactly 1/2 in an empty map and far from all clusters. Points are
@@ -52,159 +50,12 @@ class LardHilbertMap(parameters.MapParameters):
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
+        channels: sums of color, intensity, other values and classes by name (`ChannelSums`), in a map
+            that was given `channels`. They are columns of the buffer ``channel_sums`` (M, W), float64.
+        class_weights: (M, K) parameter of a map whose classes were trained (`fit_classes`), else None.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
     """
-
-    # --- queries ---
-
-    def forward(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
-        return self._query(points, probability=True)
-
-    def log_odds(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
-        return self._query(points, probability=False)
-
-    def features(self, points: TensorLike) -> Tensor:
-        """(N, D) world positions [m] -> sparse COO (N, M) with K values per row, eq. (9)."""
-        local = self._to_map_frame(points)
-        if local.ndim != 2:
-            raise ValueError(f"points must be (N, {self.dim}); got {tuple(local.shape)}")
-        indices = native.nearest_centers(
-            local, self.centers, self.num_neighbors, self._fresh_index()
-        )
-        values = lard_kernel(local, self.centers, self.scale_tril, indices)
-        values = values * neighbor_fade(local, self.centers, indices)
-        return feature_matrix(indices, values, len(self))
-
-    def variance(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) variance of the log-odds.
-
-        Far from all clusters it equals the variance of the prior.
-
-        Raises:
-            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
-        """
-        return self._posterior(points)[1]
-
-    def bayesian_probability(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
-
-        Raises:
-            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
-        """
-        mean, variance = self._posterior(points)
-        return posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance)
-
-    @torch.no_grad()
-    def unknown(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) degree to which space is unobserved, 0 to 1.
-
-        The value is 1 minus the largest feature among clusters of occupied or free points. Where the
-        probability is near 1/2, values near 0 indicate contradictory data, values near 1 no data.
-        """
-        local = self._to_map_frame(points)
-        flat = local.reshape(-1, self.dim)
-        if len(self) == 0:
-            return torch.ones_like(flat[:, 0]).reshape(local.shape[:-1])
-        parts = [flat.new_ones(0)]
-        for chunk in flat.split(posterior.QUERY_CHUNK):
-            indices, values = self._nearest_features(chunk)
-            seen = torch.where(self.counts[indices] > 0, values, 0 * values)  # NaN stays NaN
-            parts.append(1 - seen.amax(dim=1))
-        return torch.cat(parts).reshape(local.shape[:-1])
-
-    @torch.no_grad()
-    def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """Probability or log-odds at all points of a lattice. Faster than querying the points.
-
-        Args:
-            axes: D lists of world coordinates [m]; the lattice is their Cartesian product.
-            probability: True: return the probability; False: return the log-odds.
-
-        Returns:
-            (len(axes[0]), len(axes[1]), ...) values without gradient.
-
-        Raises:
-            ValueError: axes are not D lists of finite coordinates.
-        """
-        check_axes(axes, self.dim)
-        local = [
-            to_map_frame(axis, shift, self.centers.dtype)
-            for axis, shift in zip(axes, self.origin, strict=True)
-        ]
-        return native.lattice_occupancy(
-            local, *self._tensors(), probability=probability, index=self._fresh_index()
-        )
-
-    def native_map(self) -> NativeMap | None:
-        """The tensors of the map for the native library; None if it does not support this map."""
-        if len(self) == 0 or not native.supports(self.centers):
-            return None
-        tensors = (self.centers.detach(), self.raw_scale_tril.detach(), self.weights.detach())
-        return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
-
-    @torch.no_grad()
-    def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
-        """`raycasting.raycast` in the native library; None if it does not support this map.
-
-        Args:
-            origins: (R, D) world positions, float64 [m].
-            directions: (R, D) unit vectors, float64.
-            march: parameters of `native.raycast`.
-        """
-        found = self.native_map()
-        if found is None:
-            return None
-        rays = (origins - self.origin, directions)
-        return native.raycast(rays, march, found[:3], found.kernel, found.center_index)
-
-    def _query(self, points: TensorLike, probability: bool) -> Tensor:
-        local = self._to_map_frame(points)
-        flat, index = local.reshape(-1, self.dim), self._fresh_index()
-        answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
-        return answer.reshape(local.shape[:-1])
-
-    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
-        return self.centers, self.raw_scale_tril, self.weights, self.kernel
-
-    def _posterior(self, points: TensorLike) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the log-odds at (..., D) points."""
-        if not bool((self.posterior_variances > 0).all()) or len(self) == 0:
-            raise RuntimeError(
-                "variance needs the posterior of every weight; "
-                "call fit_uncertainty(points, labels) first, and again after update"
-            )
-        local = self._to_map_frame(points)
-        own = (self.posterior_means, self.posterior_variances, self.posterior_scales)
-        answer = posterior.predict(
-            self._nearest_features, local.reshape(-1, self.dim), posterior.Posterior(*own)
-        )
-        mean, variance = (values.reshape(local.shape[:-1]) for values in answer)
-        return mean, variance
-
-    def _nearest_features(self, local: Tensor) -> tuple[Tensor, Tensor]:
-        centers, raw_scale_tril = self.centers.detach(), self.raw_scale_tril.detach()
-        return native.nearest_features(
-            local, centers, raw_scale_tril, self.kernel, self._fresh_index()
-        )
-
-    def _fresh_index(self) -> Tensor:
-        """Index of the neighbor search. It is rebuilt if the centers have changed."""
-        if torch.compiler.is_compiling():  # the operators check the index themselves
-            return self._index
-        if not native.index_matches(self._index, self.centers, self.num_neighbors):
-            with torch.inference_mode(False):  # inference tensors cannot be used in training
-                self._index = native.build_index(self.centers, self.num_neighbors)
-        return self._index
-
-    def _to_map_frame(self, points: TensorLike) -> Tensor:
-        points = as_tensor(points, "points", self.origin.device)
-        check_points(points, self.dim)
-        return to_map_frame(points, self.origin, self.centers.dtype)
-
-    # --- learning ---
 
     def fit(
         self,
@@ -213,6 +64,7 @@ class LardHilbertMap(parameters.MapParameters):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
+        channels: Channels | None = None,
         progress: bool = False,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
@@ -228,6 +80,8 @@ class LardHilbertMap(parameters.MapParameters):
                 leaves the remainder to the other. None: chosen from the data
                 (`clustering.choose_num_clusters`).
             seed: random seed of clustering and training.
+            channels: values of the points by name, such as `Samples.channels`; those of the occupied
+                points are summed up in the clusters. They do not change the occupancy.
             progress: show a progress bar on a terminal.
             config: training settings of the weights.
 
@@ -235,17 +89,19 @@ class LardHilbertMap(parameters.MapParameters):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points, or
-                num_clusters is not a positive integer.
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points,
+                num_clusters is not a positive integer, or a channel is invalid.
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
+        channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "fit", self.centers.device)
         task = FitTask(self.kernel, config or FitConfig(), rng, progress)
         state = fit_clusters(samples.points, samples.labels, num_clusters, task)
-        parameters.write_state(self, state, samples.origin)
+        state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
+        parameters.write_state(self, state, samples.origin, layout)
         return self
 
     @torch.no_grad()
@@ -280,6 +136,7 @@ class LardHilbertMap(parameters.MapParameters):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
+        channels: Channels | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
         """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
@@ -296,27 +153,34 @@ class LardHilbertMap(parameters.MapParameters):
             num_clusters: maximum number of clusters near the points, over all classes. None: chosen
                 from the number of hits there.
             seed: random seed of clustering and training.
+            channels: see `fit`; channels and classes that are new to the map are added to it.
             config: update settings; `UpdateConfig(as_in_paper=True)` follows the paper.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, or num_clusters is
-                not a positive integer.
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, num_clusters is not a
+                positive integer, or a channel is invalid or of another width than in the map.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
-            return self.fit(points, labels, num_clusters, seed=seed)
+            return self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+        channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "update", self.centers.device)
         task = Task(self.kernel, config or UpdateConfig(), rng)
-        changes = updated(parameters.read_state(self), *samples[:2], num_clusters, task)
-        parameters.write_rows(self, *changes)
+        hits = channel_sums.hits_with_channels(*samples[:2], channels)
+        old = self.channel_layout
+        layout = channel_sums.joint_layout(old, channel_sums.layout_of(hits.channels))
+        state = channel_sums.with_layout(parameters.read_state(self), old, layout)
+        changes = updated(state, *samples[:2], num_clusters, task)
+        part = channel_sums.with_hits(changes.part, layout, hits)
+        parameters.write_rows(self, changes.where, part, changes.removed, layout)
         return self
 
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
@@ -379,7 +243,7 @@ class LardHilbertMap(parameters.MapParameters):
         """
         state = self.state_dict()
         if not evidence:
-            state = {name: value for name, value in state.items() if name not in parameters.HISTORY}
+            state = {name: value for name, value in state.items() if name not in HISTORY}
         map_files.save_state(state, path)
 
     @classmethod

@@ -69,9 +69,11 @@ def forget(known: MapState, which: Tensor) -> MapState:
     counts = torch.where(which, (known.counts + 3) // 4, known.counts)
     fresh = torch.where(which, kept.to(known.fresh), known.fresh)
     fraction = (counts - 1).clamp(min=1) / (known.counts - 1).clamp(min=1)
+    left = torch.where(which, left, kept)
     return replace(
         known,
-        evidence=first_points(known.evidence, torch.where(which, left, kept)),
+        evidence=first_points(known.evidence, left),
+        channel_sums=known.channel_sums * torch.where(which & (left == 0), 0, fraction)[:, None],
         counts=counts,
         fresh=fresh,
         scatters=known.scatters * fraction.to(known.scatters)[:, None, None],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,9 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.clustering import Clusters, Columns
 
 EVIDENCE = 32  # E, number of points that a cluster keeps
+PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
+HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
+CHANNELS = ("channel_sums", "class_weights")  # None in a map without them
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +23,8 @@ class MapState(Columns):
     ``evidence`` is (M, E, D), see `evidence`. ``losses`` is (M,): the mean loss of the points that a
     cluster keeps, 0 if it has not been computed. ``doubts`` is (M,), see `forgetting`.
     ``fresh`` is (M,): the number of kept points that the weights have not been trained on.
+    ``channel_sums`` is (M, W) float64, see `channel_sums`, and ``class_weights`` (M, K); W and K are 0
+    in a map without channels or without trained classes.
     """
 
     weights: Tensor
@@ -33,6 +38,8 @@ class MapState(Columns):
     losses: Tensor
     doubts: Tensor
     fresh: Tensor
+    channel_sums: Tensor
+    class_weights: Tensor
 
     def rows(self, which: Tensor) -> MapState:
         """Copies of the clusters selected by a mask or by indices, in that order."""
@@ -40,8 +47,12 @@ class MapState(Columns):
         return MapState(*(tensor.index_select(0, which) for tensor in self))
 
     def put(self, where: Tensor, part: MapState) -> MapState:
-        """A copy with rows ``where`` replaced by the first rows of ``part``, and its others appended."""
+        """A copy with rows ``where`` replaced by the first rows of ``part``, and its others appended.
+
+        Columns of channels that ``part`` does not have are 0.
+        """
         count = len(where)
+        part = replace(part, **{name: _widened(part, self, name) for name in CHANNELS})
         return MapState(
             *(
                 torch.cat([ours, theirs[count:]]).index_copy_(0, where, theirs[:count])
@@ -64,6 +75,13 @@ class MapState(Columns):
         return Clusters(self.counts, self.means, self.scatters)
 
 
+def _widened(part: MapState, like: MapState, name: str) -> Tensor:
+    """A tensor of a state with as many columns as that of another; added ones are 0."""
+    values: Tensor = getattr(part, name)
+    missing = getattr(like, name).shape[1] - values.shape[1]
+    return torch.nn.functional.pad(values, (0, missing)) if missing else values
+
+
 def new_rows(
     clusters: Clusters, is_occupied: Tensor, floor: float, evidence: Tensor | None = None
 ) -> MapState:
@@ -82,7 +100,8 @@ def new_rows(
     raw = raw_factors(factors)
     zeros = (weights.clone() for _ in range(3))
     moments = (clusters.counts, clusters.means, clusters.scatters)
-    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros)
+    none = [weights.new_zeros(len(weights), 0, dtype=kind) for kind in (torch.float64, None)]
+    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, *none)
 
 
 def no_evidence(means: Tensor) -> Tensor:

@@ -155,6 +155,19 @@ def nearest_features(
     return torch.cat([chunk[0] for chunk in chunks]), torch.cat([chunk[1] for chunk in chunks])
 
 
+def differentiable_features(
+    points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As `nearest_features`, with gradients where any of the tensors requires them."""
+    given = (points, centers, raw_scale_tril)
+    if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in given):
+        return nearest_features(*given, kernel, index)
+    indices = nearest_centers(points, centers, kernel.num_neighbors, index)
+    factors = features.kernel_factors(raw_scale_tril, kernel)
+    values = features.lard_kernel(points, centers, factors, indices)
+    return indices, values * features.neighbor_fade(points, centers, indices)
+
+
 def assign(
     points: Tensor, centers: Tensor, *, scatter: bool = True
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

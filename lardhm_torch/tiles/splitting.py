@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.learning.parameters import HISTORY, PER_MAP
+from lardhm_torch.learning.map_state import HISTORY, PER_MAP
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.indexing import Folder, tile_indices, tile_path
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest

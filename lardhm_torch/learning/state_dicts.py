@@ -1,0 +1,79 @@
+"""State dicts of maps: validated when they are loaded, compact when they are made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from lardhm_torch.channels import CLASS
+from lardhm_torch.io import map_files
+from lardhm_torch.learning.channel_sums import Layout, check_layout, num_columns
+from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
+from lardhm_torch.learning.resizing import resize, set_channels
+
+if TYPE_CHECKING:
+    from lardhm_torch.learning.parameters import MapParameters
+
+
+def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Pre-hook of `load_state_dict`: validate the state dict and adopt its number of clusters."""
+    extra = map_files.check_settings(state.get(prefix + "_extra_state"))
+    differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
+    if differing:
+        name, (ours, theirs) = next(iter(differing.items()))
+        raise ValueError(
+            f"state_dict must be of a map with {name} = {ours}; got {theirs}. "
+            f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
+            "LardHilbertMap.load"
+        )
+    _fill_evidence(state, prefix)
+    own = {name: t for name, t in model.state_tensors() if name not in CHANNELS}
+    missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
+    if missing:
+        raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
+    num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
+    shapes = {
+        name: tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
+        for name, tensor in own.items()
+    }
+    layout, columns = _channel_columns(state, prefix)
+    for name, shape in {**shapes, **{n: (num_clusters, c) for n, c in columns.items()}}.items():
+        if state[prefix + name].shape != torch.Size(shape):
+            raise ValueError(
+                f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
+                f"got {tuple(state[prefix + name].shape)}"
+            )
+    resize(model, num_clusters)
+    set_channels(model, layout, num_clusters, has_class_weights="class_weights" in columns)
+
+
+def _channel_columns(state: dict[str, Any], prefix: str) -> tuple[Layout, dict[str, int]]:
+    """The layout of the channels, and the number of columns of each of their tensors."""
+    layout = check_layout(state[prefix + "_extra_state"].get("channels", {}))
+    present = [name for name in CHANNELS if isinstance(state.get(prefix + name), Tensor)]
+    if ("channel_sums" in present) != bool(layout) or (present and not layout):
+        raise ValueError(
+            f"state_dict must have channel_sums of the channels in its settings, {list(layout)}; "
+            f"got {present or 'none'}"
+        )
+    columns = {"channel_sums": num_columns(layout), "class_weights": len(layout.get(CLASS, ()))}
+    return layout, {name: columns[name] for name in present}
+
+
+def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
+    """Add empty evidence to the state dict of a map that was saved without it."""
+    centers = state.get(prefix + "centers")
+    if not isinstance(centers, Tensor) or centers.ndim != 2:
+        return
+    for name in HISTORY:
+        if len(state.get(prefix + name, ())) == 0:
+            rows = centers.new_zeros(len(centers))
+            state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
+
+
+def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
+    for name, _tensor in model.state_tensors():
+        state[prefix + name] = map_files.without_spare_memory(state[prefix + name])
