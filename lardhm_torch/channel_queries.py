@@ -15,7 +15,6 @@ of a Dirichlet prior of weight PRIOR, which is all that is left far from the clu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -23,7 +22,6 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.channels import CLASS
-from lardhm_torch.features import QUERY_CHUNK, mixed_rows
 from lardhm_torch.learning.channel_sums import columns_of
 from lardhm_torch.maps import TensorLike
 
@@ -67,16 +65,11 @@ def interpolate(model: MapQueries, points: TensorLike, name: str) -> Tensor:
     if name == CLASS:
         return model.class_probability(points)
     own = _channel(model, name)
-    table = torch.cat([own.sums, own.counts[:, None]], dim=1).to(model.centers.dtype)
     local = model._to_map_frame(points)
-    parts = []
-    for indices, values in _features(model, local.reshape(-1, model.dim)):
-        sharp = _sharpened(values)
-        mixed = mixed_rows(indices, sharp, table)
-        total = mixed[:, -1:]
-        near = total > NEAR**4
-        parts.append((mixed[:, :-1] / total.where(near, 1)).where(near, torch.nan))
-    answer = torch.cat(parts)
+    table = torch.cat([own.sums, own.counts[:, None]], dim=1)
+    mixed = _mixture(model, local, table, sharp=True)
+    total = mixed[:, -1:]
+    answer = mixed[:, :-1] / total.where(total > NEAR**4, torch.nan)
     if model.channel_layout[name] == 0:
         return answer[:, 0].reshape(local.shape[:-1])
     return answer.reshape(*local.shape[:-1], answer.shape[1])
@@ -85,19 +78,14 @@ def interpolate(model: MapQueries, points: TensorLike, name: str) -> Tensor:
 def class_log_odds(model: MapQueries, points: TensorLike) -> Tensor:
     """`MapQueries.class_log_odds`."""
     own = _channel(model, CLASS)
-    is_known = (own.counts > 0)[:, None]
-    table = torch.cat([own.sums, is_known], dim=1).to(model.centers.dtype)
     local = model._to_map_frame(points)
     classes = own.sums.shape[1]
-    parts = []
-    for indices, values in _features(model, local.reshape(-1, model.dim)):
-        mixed = mixed_rows(indices, _sharpened(values), table)
-        counts = mixed[:, :-1] / (mixed[:, -1:] + NEAR**4)
-        log_odds = (counts + PRIOR / classes).log()
-        if model.class_weights is not None:
-            log_odds = log_odds + mixed_rows(indices, values, model.class_weights)
-        parts.append(log_odds)
-    return torch.cat(parts).reshape(*local.shape[:-1], classes)
+    table = torch.cat([own.sums, (own.counts > 0)[:, None]], dim=1)
+    mixed = _mixture(model, local, table, sharp=True)
+    answer = (mixed[:, :-1] / (mixed[:, -1:] + NEAR**4) + PRIOR / classes).log()
+    if model.class_weights is not None:
+        answer = answer + _mixture(model, local, model.class_weights, sharp=False)
+    return answer.reshape(*local.shape[:-1], classes)
 
 
 def _channel(model: MapQueries, name: str) -> ChannelSums:
@@ -110,15 +98,9 @@ def _channel(model: MapQueries, name: str) -> ChannelSums:
     return found[name]
 
 
-def _features(model: MapQueries, local: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """(N, D) positions, map frame -> indices and features of the nearest clusters, in chunks."""
-    whole = torch.compiler.is_compiling() or len(local) <= QUERY_CHUNK
-    given = (model.centers, model.raw_scale_tril, model.kernel, model._fresh_index())
-    chunks = [local] if whole else local.split(QUERY_CHUNK)
-    for chunk in chunks:
-        yield native.differentiable_features(chunk, *given)
-
-
-def _sharpened(values: Tensor) -> Tensor:
-    """phi^4: the kernel of a quarter of the covariance."""
-    return values.square().square()
+def _mixture(model: MapQueries, local: Tensor, table: Tensor, *, sharp: bool) -> Tensor:
+    """(..., D) positions, map frame -> (N, C), see `features.mixture`."""
+    centers, raw_scale_tril, _, kernel = model._tensors()
+    table = table.to(centers.dtype)
+    flat, index = local.reshape(-1, model.dim), model._fresh_index()
+    return native.mixture(flat, centers, raw_scale_tril, table, kernel, index, sharp=sharp)

@@ -252,11 +252,31 @@ def log_odds(
     return torch.cat(chunks)
 
 
-def mixed_rows(indices: Tensor, values: Tensor, table: Tensor) -> Tensor:
-    """Sum of the rows of a table, weighted by features: (N, K) indices and values, (M, C) -> (N, C)."""
-    whole = torch.compiler.is_compiling() or values.requires_grad
-    if whole:  # differentiable in the values, twice, too
-        return (values[:, :, None] * table[indices]).sum(dim=1)
-    return torch.nn.functional.embedding_bag(
-        indices, table, per_sample_weights=values, mode="sum"
-    )
+def mixture(
+    points: Tensor,
+    centers: Tensor,
+    scale_tril: Tensor,
+    table: Tensor,
+    indices: Tensor,
+    *,
+    sharp: bool,
+) -> Tensor:
+    """Sums of the rows of a table over the neighbors of each point, weighted by the features.
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m].
+        scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
+        table: (M, C) values.
+        indices: (N, K) the K nearest clusters of each point.
+        sharp: weight by the fourth power of the features, whose kernel has half the length-scales.
+
+    Returns:
+        (N, C) sums; NaN for points that are not finite.
+    """
+    values = lard_kernel(points, centers, scale_tril, indices)
+    values = values * neighbor_fade(points, centers, indices)
+    if sharp:
+        values = values.square().square()
+    total = (values[:, :, None] * table[indices]).sum(dim=1)
+    return total.where(points.isfinite().all(dim=1, keepdim=True), total.new_tensor(torch.nan))

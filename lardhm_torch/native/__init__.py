@@ -155,17 +155,30 @@ def nearest_features(
     return torch.cat([chunk[0] for chunk in chunks]), torch.cat([chunk[1] for chunk in chunks])
 
 
-def differentiable_features(
-    points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
-) -> tuple[Tensor, Tensor]:
-    """As `nearest_features`, with gradients where any of the tensors requires them."""
-    given = (points, centers, raw_scale_tril)
-    if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in given):
-        return nearest_features(*given, kernel, index)
-    indices = nearest_centers(points, centers, kernel.num_neighbors, index)
-    factors = features.kernel_factors(raw_scale_tril, kernel)
-    values = features.lard_kernel(points, centers, factors, indices)
-    return indices, values * features.neighbor_fade(points, centers, indices)
+def mixture(
+    points: Tensor,
+    centers: Tensor,
+    raw_scale_tril: Tensor,
+    table: Tensor,
+    kernel: Kernel,
+    index: Tensor,
+    *,
+    sharp: bool,
+) -> Tensor:
+    """As `features.mixture` of `features.kernel_factors`."""
+    given = (points, centers, raw_scale_tril, table)
+    needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
+    if supports(points) and not needs_gradient:
+        return torch.ops.lardhm.mixture(
+            *(tensor.detach() for tensor in given), *kernel, index, sharp
+        )
+    parts = []
+    whole = torch.compiler.is_compiling()  # the exported graph must accept any number of points
+    for chunk in [points] if whole else points.split(features.QUERY_CHUNK):
+        indices = nearest_centers(chunk, centers, kernel.num_neighbors, index)
+        factors = features.kernel_factors(raw_scale_tril, kernel)
+        parts.append(features.mixture(chunk, centers, factors, table, indices, sharp=sharp))
+    return torch.cat(parts)
 
 
 def assign(
@@ -251,6 +264,10 @@ def _register() -> None:
     @library.register_fake("lardhm::occupancy")
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0])
+
+    @library.register_fake("lardhm::mixture")
+    def _(points: Tensor, centers: Tensor, raw: Tensor, table: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(points.shape[0], table.shape[1])
 
     @library.register_fake("lardhm::lattice_occupancy")
     def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:
