@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import os
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from lardhm_torch.channels import Channels, check_channels
+from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
-from lardhm_torch.learning import channel_sums, map_merging, parameters, posterior
+from lardhm_torch.learning import (
+    channel_sums,
+    class_training,
+    map_merging,
+    parameters,
+    posterior,
+)
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.map_state import HISTORY
@@ -102,6 +110,61 @@ class LardHilbertMap(MapQueries):
         state = fit_clusters(samples.points, samples.labels, num_clusters, task)
         state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
         parameters.write_state(self, state, samples.origin, layout)
+        return self
+
+    @torch.no_grad()
+    def fit_classes(
+        self,
+        points: TensorLike,
+        classes: TensorLike,
+        num_clusters: int | None = None,
+        *,
+        seed: int = 0,
+        config: FitConfig | None = None,
+    ) -> LardHilbertMap:
+        """Train ``class_weights`` on labelled points by the multinomial log-loss.
+
+        An empty map becomes a multi-class Hilbert map without occupancy: the points of each class are
+        clustered apart, in any dimension and unit, and the probability of occupancy stays 1/2. A
+        fitted map without classes first gets the class counts of the points. Occupancy and clusters
+        of a fitted map do not change. If anything fails, the map is unchanged.
+
+        Args:
+            points: (N, D) world positions.
+            classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
+            num_clusters: number of clusters of an empty map; None: one per 15 points of a class.
+            seed: random seed of clustering and training.
+            config: training settings.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: wrong shapes, NaN or infinite points, no point has a class, or a class number
+                or probability is out of range.
+        """
+        check_num_clusters(num_clusters)
+        rng = seeded_generator(seed, "fit_classes", self.centers.device)
+        labelled = class_training.check_class_points(points, classes, self.centers)
+        kept = self._copied_posterior(slice(None))
+        if len(self) == 0:
+            found = class_training.clustered(labelled, num_clusters, self.kernel, self.centers, rng)
+        else:
+            state, origin = parameters.read_state(self), self.origin
+            found = class_training.with_classes(state, origin, self.channel_layout, labelled)
+        state, origin, layout = found
+        draft = copy.deepcopy(self)
+        parameters.write_state(draft, class_training.untrained(state), origin, layout)
+        local = draft._to_map_frame(labelled.points)
+        base = draft.class_log_odds(labelled.points)
+        targets = class_training.class_targets(labelled.classes, layout[CLASS], base.dtype)
+        samples = class_training.ClassSamples(*draft._nearest_features(local), base, targets)
+        weights = class_training.initial_weights(state, len(layout[CLASS]))
+        weights = class_training.train_class_weights(samples, weights, config or FitConfig(), rng)
+        is_fitted = len(self) > 0
+        parameters.write_state(self, replace(state, class_weights=weights), origin, layout)
+        if is_fitted:
+            self.posterior_means, self.posterior_variances, self.posterior_scales = kept
         return self
 
     @torch.no_grad()

@@ -138,12 +138,16 @@ def sum_channels(channels: Channels, layout: Layout, owners: Tensor, num_cluster
     return sums
 
 
+def column_of_class(classes: list[int], device: torch.device) -> Tensor:
+    """(max(classes) + 1,) column of each class number; -1 for those that are not there."""
+    place = torch.full((max(classes, default=-1) + 1,), -1, device=device)
+    numbers = torch.tensor(classes, dtype=torch.long, device=device)
+    return place.index_copy_(0, numbers, torch.arange(len(classes), device=device))
+
+
 def _class_counts(values: Tensor, classes: list[int], rows: Tensor, num_clusters: int) -> Tensor:
     """(M, K) counts of the classes, or sums of their probabilities."""
-    place = torch.full((max(classes, default=0) + 1,), -1, device=rows.device)
-    place[torch.tensor(classes, dtype=torch.long, device=rows.device)] = torch.arange(
-        len(classes), device=rows.device
-    )
+    place = column_of_class(classes, rows.device)
     counts = torch.zeros(num_clusters, len(classes), dtype=torch.float64, device=rows.device)
     if values.is_floating_point():
         own = place[: values.shape[1]]

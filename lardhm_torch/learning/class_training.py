@@ -1,0 +1,202 @@
+"""Multi-class Hilbert maps: clusters of labelled points of any kind, and weights of the classes.
+
+The log-odds of class k are those of the class counts around a point plus sum_m phi_m(x) V_mk. The class
+weights V (M, K) minimize the multinomial log-loss as the weights of the occupancy minimize the binary
+one; the paper names this extension in its footnote 1. They begin at 0, so that a map without training
+answers by its counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lardhm_torch.channels import CLASS, check_channels, missing
+from lardhm_torch.features import Kernel
+from lardhm_torch.learning.channel_sums import (
+    Hits,
+    Layout,
+    column_of_class,
+    joint_layout,
+    layout_of,
+    with_hits,
+    with_layout,
+)
+from lardhm_torch.learning.clustering import (
+    MAX_CHOSEN,
+    POINTS_PER_CLUSTER,
+    cluster_points,
+    concatenate_clusters,
+    points_where,
+)
+from lardhm_torch.learning.evidence import keep_points
+from lardhm_torch.learning.fitting import FitConfig, descend, stratified_batches
+from lardhm_torch.learning.map_state import MapState, new_rows
+from lardhm_torch.maps import TensorLike
+from lardhm_torch.native import nearest_centers
+from lardhm_torch.points import as_tensor, check_samples, in_morton_order, to_map_frame
+
+
+class ClassSamples(NamedTuple):
+    """What the class weights are trained on.
+
+    Args:
+        indices: (N, k) clusters nearest to each point.
+        values: (N, k) features.
+        base: (N, K) log-odds of the classes without class weights.
+        targets: (N, K) probabilities of the classes of each point; one-hot for class numbers.
+    """
+
+    indices: Tensor
+    values: Tensor
+    base: Tensor
+    targets: Tensor
+
+
+class ClassPoints(NamedTuple):
+    """(N, D) world positions in Morton order; (N,) class numbers or (N, L) probabilities."""
+
+    points: Tensor
+    classes: Tensor
+
+
+def check_class_points(points: TensorLike, classes: TensorLike, like: Tensor) -> ClassPoints:
+    """The points that have a class.
+
+    Args:
+        points: (N, D) world positions.
+        classes: (N,) class numbers, -1 where missing, or (N, L) probabilities, NaN where missing.
+        like: (M, D) tensor of the map.
+
+    Raises:
+        ValueError: wrong shapes, points that are not finite, or no point with a valid class.
+    """
+    points = as_tensor(points, "points", like.device)
+    given = torch.as_tensor(classes, device=like.device)
+    values = check_channels({CLASS: given}, len(points))[CLASS]
+    rows = (~missing(values)).nonzero().squeeze(1)
+    if len(points) and len(rows) == 0:
+        raise ValueError(f"classes must have a value for a point at least; all {len(points)} miss it")
+    points, _ = check_samples(points, torch.ones(len(points)), like.shape[1], like.device)
+    return ClassPoints(*in_morton_order(points[rows], values[rows]))
+
+
+def clustered(
+    labelled: ClassPoints,
+    num_clusters: int | None,
+    kernel: Kernel,
+    like: Tensor,
+    rng: torch.Generator,
+) -> tuple[MapState, Tensor, Layout]:
+    """Clusters of the points of each class, as those of occupied and free points; origin and layout.
+
+    Args:
+        labelled: N points; one with probabilities belongs to its most likely class.
+        num_clusters: total, divided in proportion to the points; None: one per 15 points of a class.
+        kernel: minimum length-scale.
+        like: (M, D) tensor of the map.
+        rng: random generator.
+
+    Returns:
+        Occupied clusters with weights of 0: such a map knows classes and no free space.
+    """
+    origin = labelled.points.mean(dim=0, dtype=torch.float64).round()
+    points, classes = to_map_frame(labelled.points, origin, like.dtype), labelled.classes
+    owners = classes.argmax(dim=1) if classes.is_floating_point() else classes
+    parts = []
+    for number in owners.unique().tolist():
+        (members,) = in_morton_order(points_where(points, owners == number))
+        wanted = len(members) // POINTS_PER_CLUSTER
+        if num_clusters is not None:
+            wanted = round(num_clusters * len(members) / len(points))
+        parts.append(cluster_points(members, max(1, min(wanted, MAX_CHOSEN)), rng))
+    clusters = concatenate_clusters(parts)
+    is_occupied = torch.ones_like(clusters.counts, dtype=torch.bool)
+    nearest = nearest_centers(points, clusters.means, 1).squeeze(1)
+    evidence = keep_points(points, nearest, len(clusters))
+    rows = new_rows(clusters, is_occupied, kernel.min_lengthscale, evidence)
+    return with_classes(rows, origin, {}, labelled)
+
+
+def with_classes(
+    state: MapState, origin: Tensor, layout: Layout, labelled: ClassPoints
+) -> tuple[MapState, Tensor, Layout]:
+    """Clusters of a map that have class counts, if they had none before; origin and layout."""
+    channels = {CLASS: labelled.classes}
+    joint = joint_layout(layout, layout_of(channels))
+    state = with_layout(state, layout, joint)
+    if CLASS not in layout:
+        local = to_map_frame(labelled.points, origin, state.means.dtype)
+        state = with_hits(state, joint, Hits(local, channels))
+    return state, origin, joint
+
+
+def untrained(state: MapState) -> MapState:
+    """The clusters without class weights."""
+    return replace(state, class_weights=state.class_weights[:, :0])
+
+
+def initial_weights(state: MapState, num_classes: int) -> Tensor:
+    """(M, K) class weights to begin with: those of the state, or 0."""
+    found = state.class_weights
+    return found if found.shape[1] else found.new_zeros(len(state), num_classes)
+
+
+def class_targets(classes: Tensor, columns: list[int], dtype: torch.dtype) -> Tensor:
+    """(N, K) probabilities of the classes of a map, one-hot for class numbers.
+
+    Args:
+        classes: (N,) class numbers, or (N, L) probabilities of the classes 0 to L - 1.
+        columns: numbers of the K classes of the map.
+        dtype: of the result.
+    """
+    place = column_of_class(columns, classes.device)
+    if not classes.is_floating_point():
+        return torch.nn.functional.one_hot(place[classes], len(columns)).to(dtype)
+    result = torch.zeros(len(classes), len(columns), dtype=dtype, device=classes.device)
+    return result.index_copy_(1, place[: classes.shape[1]], classes.to(dtype))
+
+
+def train_class_weights(
+    samples: ClassSamples, weights: Tensor, config: FitConfig, rng: torch.Generator
+) -> Tensor:
+    """Minimize the multinomial log-loss by the descent of eq. (4), with its regularizer.
+
+    Args:
+        samples: N points, in the order of `morton_order`.
+        weights: (M, K) initial class weights; not modified.
+        config: passes, rates and regularizer.
+        rng: random generator of the batches.
+
+    Returns:
+        (M, K) class weights.
+
+    Source: Guizilini & Ramos 2016, eq. (2) to (4), with the softmax in place of the sigmoid.
+    """
+    count = len(samples.targets)
+    batch_size = config.rows_per_batch(count)
+    columns = ClassSamples(*stratified_batches(tuple(samples), batch_size, rng))
+    passes = config.passes_over(count)
+    total = passes * -(-count // batch_size)
+    state, step = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights)), 0
+    for _ in range(passes):
+        for batch in zip(*(column.split(batch_size) for column in columns), strict=True):
+            slope = _slope(ClassSamples(*batch), state[0])
+            rate = config.learning_rate * (1 - step / total if config.decay else 1.0)
+            step += 1
+            state = descend(state, slope, step, rate, count, config)
+    return state[0]
+
+
+def _slope(batch: ClassSamples, weights: Tensor) -> Tensor:
+    """(M, K) gradient of the mean loss of a batch: Phi^T (p - y) / B."""
+    mixed = torch.nn.functional.embedding_bag(
+        batch.indices, weights, per_sample_weights=batch.values, mode="sum"
+    )
+    residuals = torch.softmax(batch.base + mixed, dim=1) - batch.targets
+    terms = batch.values[:, :, None] * residuals[:, None] / len(residuals)
+    rows = batch.indices.reshape(-1)
+    return torch.zeros_like(weights).index_add_(0, rows, terms.flatten(0, 1))
