@@ -120,6 +120,7 @@ class LardHilbertMap(MapQueries):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
+        wrong_labels: float = 0.0,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
         """Train ``class_weights`` on labelled points by the multinomial log-loss.
@@ -134,16 +135,20 @@ class LardHilbertMap(MapQueries):
             classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
             num_clusters: number of clusters of an empty map; None: one per 15 points of a class.
             seed: random seed of clustering and training.
+            wrong_labels: fraction of the labels that are those of a random other class. The map then
+                answers for the true class.
             config: training settings.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, no point has a class, or a class number
-                or probability is out of range.
+            ValueError: wrong shapes, NaN or infinite points, no point has a class, or a class number,
+                probability or wrong_labels is out of range.
         """
         check_num_clusters(num_clusters)
+        if not 0 <= wrong_labels < 0.5:
+            raise ValueError(f"wrong_labels must be at least 0 and below 1/2; got {wrong_labels}")
         rng = seeded_generator(seed, "fit_classes", self.centers.device)
         labelled = class_training.check_class_points(points, classes, self.centers)
         kept = self._copied_posterior(slice(None))
@@ -160,7 +165,9 @@ class LardHilbertMap(MapQueries):
         targets = class_training.class_targets(labelled.classes, layout[CLASS], base.dtype)
         samples = class_training.ClassSamples(*draft._nearest_features(local), base, targets)
         weights = class_training.initial_weights(state, len(layout[CLASS]))
-        weights = class_training.train_class_weights(samples, weights, config or FitConfig(), rng)
+        weights = class_training.train_class_weights(
+            samples, weights, config or FitConfig(), rng, wrong_labels
+        )
         is_fitted = len(self) > 0
         parameters.write_state(self, replace(state, class_weights=weights), origin, layout)
         if is_fitted:

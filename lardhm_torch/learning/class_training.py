@@ -161,15 +161,22 @@ def class_targets(classes: Tensor, columns: list[int], dtype: torch.dtype) -> Te
 
 
 def train_class_weights(
-    samples: ClassSamples, weights: Tensor, config: FitConfig, rng: torch.Generator
+    samples: ClassSamples,
+    weights: Tensor,
+    config: FitConfig,
+    rng: torch.Generator,
+    wrong_labels: float = 0.0,
 ) -> Tensor:
     """Minimize the multinomial log-loss by the descent of eq. (4), with its regularizer.
+
+    Weights of clusters that are no neighbor of a point stay as they are.
 
     Args:
         samples: N points, in the order of `morton_order`.
         weights: (M, K) initial class weights; not modified.
         config: passes, rates and regularizer.
         rng: random generator of the batches.
+        wrong_labels: fraction of the labels that are those of a random other class.
 
     Returns:
         (M, K) class weights.
@@ -184,19 +191,31 @@ def train_class_weights(
     state, step = (weights.clone(), torch.zeros_like(weights), torch.zeros_like(weights)), 0
     for _ in range(passes):
         for batch in zip(*(column.split(batch_size) for column in columns), strict=True):
-            slope = _slope(ClassSamples(*batch), state[0])
+            slope = _slope(ClassSamples(*batch), state[0], wrong_labels)
             rate = config.learning_rate * (1 - step / total if config.decay else 1.0)
             step += 1
             state = descend(state, slope, step, rate, count, config)
-    return state[0]
+    touched = torch.zeros(len(weights), dtype=torch.bool, device=weights.device)
+    touched[samples.indices.reshape(-1).long()] = True
+    return torch.where(touched[:, None], state[0], weights)
 
 
-def _slope(batch: ClassSamples, weights: Tensor) -> Tensor:
-    """(M, K) gradient of the mean loss of a batch: Phi^T (p - y) / B."""
+def _slope(batch: ClassSamples, weights: Tensor, wrong_labels: float) -> Tensor:
+    """(M, K) gradient of the mean loss of a batch: Phi^T (p - q) / B.
+
+    q is the posterior of the true class given the label: the target itself if no label is wrong.
+    """
     mixed = torch.nn.functional.embedding_bag(
         batch.indices, weights, per_sample_weights=batch.values, mode="sum"
     )
-    residuals = torch.softmax(batch.base + mixed, dim=1) - batch.targets
-    terms = batch.values[:, :, None] * residuals[:, None] / len(residuals)
+    probability = torch.softmax(batch.base + mixed, dim=1)
+    wanted = batch.targets
+    if wrong_labels:
+        classes = weights.shape[1]
+        others = wrong_labels / max(1, classes - 1)
+        right = 1 - wrong_labels - others  # P(label | class) = others + right [label = class]
+        ratio = wanted / (others + right * probability)
+        wanted = probability * (others * ratio.sum(dim=1, keepdim=True) + right * ratio)
+    terms = batch.values[:, :, None] * (probability - wanted)[:, None] / len(wanted)
     rows = batch.indices.reshape(-1)
     return torch.zeros_like(weights).index_add_(0, rows, terms.flatten(0, 1))
