@@ -1,14 +1,18 @@
 """Channels of a map: what its occupied clusters sum up of the colors, values and classes of the hits.
 
-The statistics of a cluster are sufficient for means and class frequencies, and they add up: those of
-merged clusters are the sums of theirs. All channels of a map are columns of one (M, W) float64 tensor:
+Every hit adds the products of its values v with (1, x) to its cluster, where x is its position in the
+map frame: the sums of v and their first moments. They are sufficient for the mean of a channel and its
+linear trend in a cluster, and they add up: those of merged clusters are the sums of theirs. All are rows
+of one (M, R, 1 + D) float64 tensor:
 
-- a channel of C values has C sums and the number of hits that were not missing;
-- classes have one count for each class, a sum of probabilities where labels are probabilities.
+- first D + 1 rows for the values x_1 to x_D and 1 of all hits with any channel: their number, and the
+  first and second moments of their positions;
+- a channel of C values has C rows, and one for the value 1 of the hits where it is not missing;
+- classes have one row for each class, for its probability: 1 or 0 where labels are numbers.
 
-A layout names the columns: ``{"color": 3, "intensity": 0, "class": [7, 2]}`` are 4 columns of color,
-2 of intensity (0: values without a second dimension) and the counts of classes 7 and 2. It holds
-plain values, and is stored with the map.
+A layout names the rows: ``{"color": 3, "intensity": 0, "class": [7, 2]}`` are 4 rows of color, 2 of
+intensity (0: values without a second dimension) and those of classes 7 and 2. It holds plain values,
+and is stored with the map.
 """
 
 from __future__ import annotations
@@ -65,9 +69,9 @@ def joint_layout(first: Layout, second: Layout) -> Layout:
     return {name: joint[name] for name in dict.fromkeys([*first, *second])}
 
 
-def columns_of(layout: Layout) -> dict[str, slice]:
-    """The columns of each channel."""
-    found, start = {}, 0
+def rows_of(layout: Layout, dim: int) -> dict[str, slice]:
+    """The rows of each channel in a map of D = ``dim`` coordinates."""
+    found, start = {}, dim + 1
     for name, size in layout.items():
         width = len(size) if name == CLASS else max(1, size) + 1
         found[name] = slice(start, start + width)
@@ -75,9 +79,15 @@ def columns_of(layout: Layout) -> dict[str, slice]:
     return found
 
 
-def num_columns(layout: Layout) -> int:
-    """Number of columns W of a layout."""
-    return max((columns.stop for columns in columns_of(layout).values()), default=0)
+def num_rows(layout: Layout, dim: int) -> int:
+    """Number of rows R of a layout."""
+    return max((rows.stop for rows in rows_of(layout, dim).values()), default=0)
+
+
+def no_sums(like: Tensor, layout: Layout) -> Tensor:
+    """(M, R, 1 + D) zeros for (M, D) centers."""
+    count, dim = like.shape
+    return like.new_zeros(count, num_rows(layout, dim), 1 + dim, dtype=torch.float64)
 
 
 def check_layout(value: Any) -> Layout:
@@ -99,43 +109,58 @@ def check_layout(value: Any) -> Layout:
 
 
 def conformed(sums: Tensor, before: Layout, after: Layout) -> Tensor:
-    """(M, W) sums in another layout that has all channels and classes of theirs; others are 0."""
+    """(M, R, 1 + D) sums in another layout that has all channels and classes of theirs; others are 0."""
     if before == after:
         return sums
-    result = sums.new_zeros(len(sums), num_columns(after))
-    old, new = columns_of(before), columns_of(after)
-    for name, columns in old.items():
-        width = columns.stop - columns.start  # joint layouts append classes: theirs come first
-        result[:, new[name].start : new[name].start + width] = sums[:, columns]
+    dim = sums.shape[2] - 1
+    result = sums.new_zeros(len(sums), num_rows(after, dim), 1 + dim)
+    if before:
+        result[:, : dim + 1] = sums[:, : dim + 1]
+    new = rows_of(after, dim)
+    for name, rows in rows_of(before, dim).items():
+        width = rows.stop - rows.start  # joint layouts append classes: theirs come first
+        result[:, new[name].start : new[name].start + width] = sums[:, rows]
     return result
 
 
-def sum_channels(channels: Channels, layout: Layout, owners: Tensor, num_clusters: int) -> Tensor:
-    """(M, W) sums of the values of points over clusters, float64; missing values are left out.
+def sum_channels(hits: Hits, layout: Layout, owners: Tensor, num_clusters: int) -> Tensor:
+    """(M, R, 1 + D) sums over the hits of each cluster; missing values are left out.
 
     Args:
-        channels: values of N points.
-        layout: of the result; it has all of these channels and classes.
-        owners: (N,) cluster of each point.
+        hits: H points and their channels.
+        layout: of the result; it has all channels and classes of the hits.
+        owners: (H,) cluster of each hit.
         num_clusters: M.
     """
-    sums = torch.zeros(
-        num_clusters, num_columns(layout), dtype=torch.float64, device=owners.device
-    )
-    for name, columns in columns_of(layout).items():
-        if name not in channels:
+    dim = hits.points.shape[1]
+    ones = hits.points.new_ones(len(owners), 1, dtype=torch.float64)
+    moments = torch.cat([ones, hits.points.double()], dim=1)
+    sums = moments.new_zeros(num_clusters, num_rows(layout, dim), 1 + dim)
+    sums[:, : dim + 1] = _moments(moments.roll(-1, dims=1), moments, owners, num_clusters)
+    for name, rows in rows_of(layout, dim).items():
+        if name not in hits.channels:
             continue
-        present = (~missing(channels[name])).nonzero().squeeze(1)
-        values, rows = channels[name].index_select(0, present), owners.index_select(0, present)
+        present = (~missing(hits.channels[name])).nonzero().squeeze(1)
+        values = hits.channels[name].index_select(0, present)
+        own, around = owners.index_select(0, present), moments.index_select(0, present)
+        if name == CLASS and not values.is_floating_point():
+            sums[:, rows] = _class_moments(values, layout[CLASS], around, own, num_clusters)
+            continue
+        values = values.double().reshape(len(own), -1)
         if name == CLASS:
-            sums[:, columns] = _class_counts(values, layout[CLASS], rows, num_clusters)
-            continue
-        values = values.double().reshape(len(rows), -1)
-        values = torch.cat([values, values.new_ones(len(rows), 1)], dim=1)
-        sums[:, columns] = values.new_zeros(num_clusters, values.shape[1]).index_add_(
-            0, rows, values
-        )
+            columns = column_of_class(layout[CLASS], own.device)[: values.shape[1]]
+            values = values.new_zeros(len(own), len(layout[CLASS])).index_copy(1, columns, values)
+        else:
+            values = torch.cat([values, ones[: len(own)]], dim=1)
+        sums[:, rows] = _moments(values, around, own, num_clusters)
     return sums
+
+
+def _moments(values: Tensor, moments: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
+    """(H, C) values and (H, 1 + D) moments -> (M, C, 1 + D) sums of their products."""
+    products = values[:, :, None] * moments[:, None]
+    shape = (num_clusters, *products.shape[1:])
+    return products.new_zeros(shape).index_add_(0, owners, products)
 
 
 def column_of_class(classes: list[int], device: torch.device) -> Tensor:
@@ -145,16 +170,13 @@ def column_of_class(classes: list[int], device: torch.device) -> Tensor:
     return place.index_copy_(0, numbers, torch.arange(len(classes), device=device))
 
 
-def _class_counts(values: Tensor, classes: list[int], rows: Tensor, num_clusters: int) -> Tensor:
-    """(M, K) counts of the classes, or sums of their probabilities."""
-    place = column_of_class(classes, rows.device)
-    counts = torch.zeros(num_clusters, len(classes), dtype=torch.float64, device=rows.device)
-    if values.is_floating_point():
-        own = place[: values.shape[1]]
-        found = counts.new_zeros(num_clusters, values.shape[1]).index_add_(0, rows, values.double())
-        return counts.index_add_(1, own, found)
-    keys = rows * len(classes) + place[values]
-    return torch.bincount(keys, minlength=counts.numel()).reshape(counts.shape).double()
+def _class_moments(
+    values: Tensor, classes: list[int], moments: Tensor, owners: Tensor, num_clusters: int
+) -> Tensor:
+    """(M, K, 1 + D) sums of the moments of the hits of each class number."""
+    keys = owners * len(classes) + column_of_class(classes, owners.device)[values]
+    sums = moments.new_zeros(num_clusters * len(classes), moments.shape[1])
+    return sums.index_add_(0, keys, moments).reshape(num_clusters, len(classes), -1)
 
 
 class Hits(NamedTuple):
@@ -211,7 +233,7 @@ def with_hits(state: MapState, layout: Layout, hits: Hits) -> MapState:
     if len(rows) == 0 or len(hits.points) == 0:
         return state
     owners = native.nearest_centers(hits.points, state.means[rows], 1).squeeze(1)
-    found = sum_channels(hits.channels, layout, owners, len(rows))
+    found = sum_channels(hits, layout, owners, len(rows))
     return replace(state, channel_sums=state.channel_sums.index_add(0, rows, found))
 
 
@@ -247,7 +269,7 @@ def handed_over(state: MapState, alive: Tensor) -> MapState:
     """
     if state.channel_sums.shape[1] == 0:
         return state
-    dying = (~alive & (state.channel_sums != 0).any(dim=1)).nonzero().squeeze(1)
+    dying = (~alive & (state.channel_sums != 0).flatten(1).any(dim=1)).nonzero().squeeze(1)
     heirs = (alive & state.is_occupied).nonzero().squeeze(1)
     if len(dying) == 0 or len(heirs) == 0:
         return state
@@ -255,3 +277,16 @@ def handed_over(state: MapState, alive: Tensor) -> MapState:
     sums = state.channel_sums.index_add(0, heirs[nearest], state.channel_sums[dying])
     return replace(state, channel_sums=sums.index_fill(0, dying, 0))
 
+
+
+def moved_sums(sums: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
+    """(M, R, 1 + D) sums after the positions x became rotation x + shift."""
+    if sums.shape[1] == 0:
+        return sums
+    dim = sums.shape[2] - 1
+    transform = torch.eye(dim + 1, dtype=sums.dtype, device=sums.device)  # of (1, x)
+    transform[1:, 0], transform[1:, 1:] = shift, rotation
+    moved = sums @ transform.T
+    positions = transform.roll((-1, -1), dims=(0, 1))  # of the values (x, 1) of the first rows
+    moved[:, : dim + 1] = positions @ moved[:, : dim + 1]
+    return moved

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors, lard_kernel, raw_factors
-from lardhm_torch.learning.channel_sums import joint_layout, with_layout
+from lardhm_torch.learning.channel_sums import joint_layout, moved_sums, with_layout
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
@@ -80,6 +80,7 @@ def moved(
             state.evidence.isfinite(), torch.inf
         ),
         scatters=scatters.to(state.scatters.dtype),
+        channel_sums=moved_sums(state.channel_sums, rotation, shift),
     )
     return after, new_origin
 
@@ -185,6 +186,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         centers=theirs.centers + shift,
         means=theirs.means + shift,
         evidence=theirs.evidence + shift,
+        channel_sums=moved_sums(theirs.channel_sums, torch.eye(len(shift)), shift),
     )
     rng = seeded_generator(seed, "merge_maps", shift.device)
     pooled = _pooled(ours, theirs, first.kernel)

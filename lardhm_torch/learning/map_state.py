@@ -23,7 +23,7 @@ class MapState(Columns):
     ``evidence`` is (M, E, D), see `evidence`. ``losses`` is (M,): the mean loss of the points that a
     cluster keeps, 0 if it has not been computed. ``doubts`` is (M,), see `forgetting`.
     ``fresh`` is (M,): the number of kept points that the weights have not been trained on.
-    ``channel_sums`` is (M, W) float64, see `channel_sums`, and ``class_weights`` (M, K); W and K are 0
+    ``channel_sums`` is (M, R, 1 + D) float64, see `channel_sums`; ``class_weights`` (M, K). R, K are 0
     in a map without channels or without trained classes.
     """
 
@@ -76,10 +76,13 @@ class MapState(Columns):
 
 
 def _widened(part: MapState, like: MapState, name: str) -> Tensor:
-    """A tensor of a state with as many columns as that of another; added ones are 0."""
+    """A tensor of a state with as many rows per cluster as that of another; added ones are 0."""
     values: Tensor = getattr(part, name)
     missing = getattr(like, name).shape[1] - values.shape[1]
-    return torch.nn.functional.pad(values, (0, missing)) if missing else values
+    if not missing:
+        return values
+    added = values.new_zeros(len(values), missing, *values.shape[2:])
+    return torch.cat([values, added], dim=1)
 
 
 def new_rows(
@@ -100,7 +103,11 @@ def new_rows(
     raw = raw_factors(factors)
     zeros = (weights.clone() for _ in range(3))
     moments = (clusters.counts, clusters.means, clusters.scatters)
-    none = [weights.new_zeros(len(weights), 0, dtype=kind) for kind in (torch.float64, None)]
+    dim = clusters.means.shape[1]
+    none = (
+        weights.new_zeros(len(weights), 0, 1 + dim, dtype=torch.float64),
+        weights.new_zeros(len(weights), 0),
+    )
     return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, *none)
 
 

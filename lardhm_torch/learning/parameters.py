@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.channel_sums import Layout
+from lardhm_torch.learning.channel_sums import Layout, no_sums
 from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState
 from lardhm_torch.learning.resizing import extend_channels, resize, set_class_weights
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
@@ -167,7 +167,7 @@ class MapParameters(nn.Module):
 def read_state(model: MapParameters) -> MapState:
     """The tensors of the map, detached but not copied."""
     none = {
-        "channel_sums": model.weights.detach().new_zeros(len(model), 0, dtype=torch.float64),
+        "channel_sums": no_sums(model.centers.detach(), {}),
         "class_weights": model.weights.detach().new_zeros(len(model), 0),
     }
     tensors = {field.name: getattr(model, field.name) for field in fields(MapState)}

@@ -135,7 +135,7 @@ def _half(
         rows,
         weights=parents.weights,
         fresh=kept_counts(evidence).to(parents.weights),
-        channel_sums=parents.channel_sums * fraction[:, None],
+        channel_sums=parents.channel_sums * fraction[:, None, None],
         class_weights=parents.class_weights,
     )
 

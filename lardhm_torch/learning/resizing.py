@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lardhm_torch.channels import CLASS
-from lardhm_torch.learning.channel_sums import Layout, conformed, num_columns
+from lardhm_torch.learning.channel_sums import Layout, conformed, no_sums
 from lardhm_torch.learning.map_state import PER_MAP
 
 if TYPE_CHECKING:
@@ -77,13 +77,12 @@ def _set_shape(parameter: nn.Parameter, room: Tensor) -> None:
     parameter.data = room
 
 
-def set_channels(model: MapParameters, layout: Layout, rows: int, has_class_weights: bool) -> None:
-    """Give a map of M = ``rows`` clusters the channels of a layout, with sums of 0."""
-    sums = torch.zeros(rows, num_columns(layout), dtype=torch.float64, device=model.origin.device)
+def set_channels(model: MapParameters, layout: Layout, has_class_weights: bool) -> None:
+    """Give a map the channels of a layout, with sums of 0."""
     model.channel_layout = layout
-    model.channel_sums = sums if layout else None
+    model.channel_sums = no_sums(model.centers.detach(), layout) if layout else None
     classes = len(layout.get(CLASS, ())) if has_class_weights else 0
-    set_class_weights(model, model.weights.detach().new_zeros(rows, classes))
+    set_class_weights(model, model.weights.detach().new_zeros(len(model), classes))
 
 
 def extend_channels(model: MapParameters, layout: Layout) -> None:
@@ -98,9 +97,9 @@ def extend_channels(model: MapParameters, layout: Layout) -> None:
         return
     sums = model.channel_sums
     if sums is None:
-        sums = torch.zeros(len(model), 0, dtype=torch.float64, device=model.origin.device)
+        sums = no_sums(model.centers.detach(), {})
     model.channel_layout = layout
-    model.channel_sums = conformed(sums.detach(), before, layout)
+    model.channel_sums = conformed(sums, before, layout)
     if model.class_weights is not None:
         missing = len(layout[CLASS]) - model.class_weights.shape[1]
         padded = nn.functional.pad(model.class_weights.detach(), (0, missing))

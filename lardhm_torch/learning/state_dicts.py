@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lardhm_torch.channels import CLASS
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.channel_sums import Layout, check_layout, num_columns
+from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
 from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
 from lardhm_torch.learning.resizing import resize, set_channels
 
@@ -34,23 +34,26 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
     if missing:
         raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
     num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
-    shapes = {
+    shapes: dict[str, tuple[int, ...]] = {
         name: tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
         for name, tensor in own.items()
     }
-    layout, columns = _channel_columns(state, prefix)
-    for name, shape in {**shapes, **{n: (num_clusters, c) for n, c in columns.items()}}.items():
+    layout, own_shapes = _channel_shapes(state, prefix, model.dim)
+    shapes.update({name: (num_clusters, *shape) for name, shape in own_shapes.items()})
+    for name, shape in shapes.items():
         if state[prefix + name].shape != torch.Size(shape):
             raise ValueError(
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
                 f"got {tuple(state[prefix + name].shape)}"
             )
     resize(model, num_clusters)
-    set_channels(model, layout, num_clusters, has_class_weights="class_weights" in columns)
+    set_channels(model, layout, has_class_weights="class_weights" in own_shapes)
 
 
-def _channel_columns(state: dict[str, Any], prefix: str) -> tuple[Layout, dict[str, int]]:
-    """The layout of the channels, and the number of columns of each of their tensors."""
+def _channel_shapes(
+    state: dict[str, Any], prefix: str, dim: int
+) -> tuple[Layout, dict[str, tuple[int, ...]]]:
+    """The layout of the channels, and the shape of a row of each of their tensors."""
     layout = check_layout(state[prefix + "_extra_state"].get("channels", {}))
     present = [name for name in CHANNELS if isinstance(state.get(prefix + name), Tensor)]
     if ("channel_sums" in present) != bool(layout) or (present and not layout):
@@ -58,8 +61,11 @@ def _channel_columns(state: dict[str, Any], prefix: str) -> tuple[Layout, dict[s
             f"state_dict must have channel_sums of the channels in its settings, {list(layout)}; "
             f"got {present or 'none'}"
         )
-    columns = {"channel_sums": num_columns(layout), "class_weights": len(layout.get(CLASS, ()))}
-    return layout, {name: columns[name] for name in present}
+    shapes = {
+        "channel_sums": (num_rows(layout, dim), 1 + dim),
+        "class_weights": (len(layout.get(CLASS, ())),),
+    }
+    return layout, {name: shapes[name] for name in present}
 
 
 def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
