@@ -12,7 +12,8 @@ over clusters, no less than 0, and the posterior
 
     (c_k(x) + PRIOR / K) / (sum_k c_k(x) + PRIOR)
 
-of a Dirichlet prior of weight PRIOR, which is all that is left far from the clusters.
+of a Dirichlet prior of weight PRIOR, which is all that is left far from the clusters. Its logarithm is
+multiplied by the ``class_scale`` of the map, which is 1 until `LardHilbertMap.calibrate_classes`.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def class_log_odds(model: MapQueries, points: TensorLike) -> Tensor:
     classes = functions.shape[1] - 1
     mixed = _mixture(model, local, functions, sharp=True)
     counts = mixed[:, :-1].clamp(min=0) / (mixed[:, -1:] + NEAR**4)
-    answer = (counts + PRIOR / classes).log()
+    answer = model.class_scale * (counts + PRIOR / classes).log()
     if model.class_weights is not None:
         answer = answer + _mixture(model, local, model.class_weights[:, :, None], sharp=False)
     return answer.reshape(*local.shape[:-1], classes)

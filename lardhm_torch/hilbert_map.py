@@ -110,6 +110,7 @@ class LardHilbertMap(MapQueries):
         state = fit_clusters(samples.points, samples.labels, num_clusters, task)
         state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
         parameters.write_state(self, state, samples.origin, layout)
+        self.class_scale = 1.0
         return self
 
     @torch.no_grad()
@@ -147,8 +148,7 @@ class LardHilbertMap(MapQueries):
                 probability or wrong_labels is out of range.
         """
         check_num_clusters(num_clusters)
-        if not 0 <= wrong_labels < 0.5:
-            raise ValueError(f"wrong_labels must be at least 0 and below 1/2; got {wrong_labels}")
+        class_training.check_wrong_labels(wrong_labels)
         rng = seeded_generator(seed, "fit_classes", self.centers.device)
         labelled = class_training.check_class_points(points, classes, self.centers)
         kept = self._copied_posterior(slice(None))
@@ -172,6 +172,35 @@ class LardHilbertMap(MapQueries):
         parameters.write_state(self, replace(state, class_weights=weights), origin, layout)
         if is_fitted:
             self.posterior_means, self.posterior_variances, self.posterior_scales = kept
+        return self
+
+    @torch.no_grad()
+    def calibrate_classes(
+        self, points: TensorLike, classes: TensorLike, *, wrong_labels: float = 0.0
+    ) -> LardHilbertMap:
+        """Set ``class_scale``, the factor on the class log-odds, to the most likely one for some labels.
+
+        The counts of a cluster answer for a random one of its labels. If a few of them are wrong, they
+        are too cautious about its true class. The factor changes confidences, and no most likely
+        class. Use points that the map has not seen, such as the next scan before it is added.
+
+        Args:
+            points: (N, D) world positions on surfaces [m].
+            classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
+            wrong_labels: fraction of the labels that are those of a random other class.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: the map has no classes, or see `fit_classes`.
+        """
+        class_training.check_wrong_labels(wrong_labels)
+        labelled = class_training.check_class_points(points, classes, self.centers)
+        labelled = class_training.of_known_classes(labelled, self.classes)
+        targets = class_training.class_targets(labelled.classes, self.classes, self.weights.dtype)
+        log_odds = self.class_log_odds(labelled.points) / self.class_scale
+        self.class_scale = class_training.best_scale(log_odds, targets, wrong_labels)
         return self
 
     @torch.no_grad()

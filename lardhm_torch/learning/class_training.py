@@ -134,6 +134,34 @@ def with_classes(
     return state, origin, joint
 
 
+def check_wrong_labels(wrong_labels: float) -> None:
+    """Raise a ValueError if a fraction of wrong labels is not from 0 to 1/2."""
+    if not 0 <= wrong_labels < 0.5:
+        raise ValueError(f"wrong_labels must be at least 0 and below 1/2; got {wrong_labels}")
+
+
+def of_known_classes(labelled: ClassPoints, columns: list[int]) -> ClassPoints:
+    """The points of classes that a map has.
+
+    Raises:
+        ValueError: the map has no classes, or there is no such point.
+    """
+    if not columns:
+        raise ValueError("the map must have classes; it has none. Give channels to fit or update")
+    classes = labelled.classes
+    if classes.is_floating_point():
+        if classes.shape[1] > max(columns) + 1 or set(range(classes.shape[1])) - set(columns):
+            raise ValueError(
+                f"class probabilities must be those of the map's classes {columns}; "
+                f"got {classes.shape[1]} columns"
+            )
+        return labelled
+    rows = torch.isin(classes, torch.tensor(columns, device=classes.device)).nonzero().squeeze(1)
+    if len(rows) == 0:
+        raise ValueError(f"classes must be some of the map's classes {columns}; no point has one")
+    return ClassPoints(labelled.points[rows], classes[rows])
+
+
 def untrained(state: MapState) -> MapState:
     """The clusters without class weights."""
     return replace(state, class_weights=state.class_weights[:, :0])
@@ -158,6 +186,24 @@ def class_targets(classes: Tensor, columns: list[int], dtype: torch.dtype) -> Te
         return torch.nn.functional.one_hot(place[classes], len(columns)).to(dtype)
     result = torch.zeros(len(classes), len(columns), dtype=dtype, device=classes.device)
     return result.index_copy_(1, place[: classes.shape[1]], classes.to(dtype))
+
+
+def best_scale(log_odds: Tensor, targets: Tensor, wrong_labels: float) -> float:
+    """Factor on class log-odds for which the labels of N points are most likely.
+
+    Args:
+        log_odds: (N, K) log-odds.
+        targets: (N, K) probabilities of the labels, one-hot for class numbers.
+        wrong_labels: fraction of the labels that are those of a random other class.
+    """
+    scales = torch.logspace(-1, 1, 41, base=10.0, dtype=torch.float64).tolist()
+    others = wrong_labels / max(1, targets.shape[1] - 1)
+    losses = []
+    for scale in scales:
+        probability = others + (1 - wrong_labels - others) * torch.softmax(scale * log_odds, dim=1)
+        tiny = torch.finfo(probability.dtype).tiny
+        losses.append(-float((targets * probability.clamp(min=tiny).log()).sum()))
+    return scales[losses.index(min(losses))]
 
 
 def train_class_weights(

@@ -60,6 +60,7 @@ class MapParameters(nn.Module):
         self.min_lengthscale = float(min_lengthscale)
         self._register_empty(dim, device, dtype)
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
+        self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
         self._index = torch.empty(0, dtype=torch.uint8)
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self.register_load_state_dict_pre_hook(make_room)
@@ -148,8 +149,10 @@ class MapParameters(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Format version and settings, stored in the state dict with the tensors."""
-        channels = {"channels": self.channel_layout} if self.channel_layout else {}
-        return {"format_version": map_files.FORMAT_VERSION, **self.settings, **channels}
+        state = {"format_version": map_files.FORMAT_VERSION, **self.settings}
+        if self.channel_layout:
+            state |= {"channels": self.channel_layout, "class_scale": self.class_scale}
+        return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Do nothing: `make_room` has already checked that the settings agree."""

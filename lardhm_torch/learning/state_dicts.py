@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -47,6 +48,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
                 f"got {tuple(state[prefix + name].shape)}"
             )
     resize(model, num_clusters)
+    model.class_scale = _class_scale(state, prefix)
     set_channels(model, layout, has_class_weights="class_weights" in own_shapes)
 
 
@@ -66,6 +68,14 @@ def _channel_shapes(
         "class_weights": (len(layout.get(CLASS, ())),),
     }
     return layout, {name: shapes[name] for name in present}
+
+
+def _class_scale(state: dict[str, Any], prefix: str) -> float:
+    """The scale of the class log-odds; 1 for a map without channels."""
+    scale = state[prefix + "_extra_state"].get("class_scale", 1.0)
+    if not isinstance(scale, float) or not 0 < scale < math.inf:
+        raise ValueError(f"class_scale must be a finite number above 0; got {scale!r}")
+    return scale
 
 
 def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
