@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.channel_columns import CHANNEL_COLUMNS, channels_from_columns
 from lardhm_torch.io.notes import Note
 
-COLUMN_NAMES = frozenset(
+RAY_COLUMNS = frozenset(
     {"x", "y", "z", "ox", "oy", "oz", "scan_id", "is_return", "target_index", "return_number"}
 )
+COLUMN_NAMES = RAY_COLUMNS | CHANNEL_COLUMNS  # those that are read
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ def without_zeros(readout: Readout) -> Readout:
 def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
     """Named columns of equal length as rays: x y [z], ox oy [oz], scan_id, is_return, target_index.
 
+    Columns of `channel_columns` have the types of the file and become channels.
     Rows with the same scan_id and the same origin are one scan. Scans are numbered in ascending
     scan_id, or, without one, in order of first appearance.
 
@@ -135,6 +138,7 @@ def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
         None if is_return is None else whole_numbers(is_return, "is_return", 0, 1).astype(bool),
         None if target is None else whole_numbers(target, "target_index", 1, 2**31),
         notes=notes,
+        channels=channels_from_columns(columns),
     )
 
 
