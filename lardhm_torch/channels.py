@@ -19,7 +19,9 @@ import torch
 from torch import Tensor
 
 CLASS, COLOR, INTENSITY = "class", "color", "intensity"
-MOST_CLASSES = 1 << 16  # class numbers are below; larger ones are identifiers of objects, or mistakes
+MOST_CLASSES = (
+    1 << 16
+)  # class numbers are below; larger ones are identifiers of objects, or mistakes
 Channels: TypeAlias = Mapping[str, Tensor]
 
 

@@ -145,7 +145,12 @@ def test_e57_files_of_pye57(tmp_path):
 def test_point_clouds_of_rosbags(tmp_path, name, is_float):
     pytest.importorskip("rosbags", reason="rosbags is not installed (extra io)")
     maker = BagMaker(is_ros1=name.endswith(".bag"))
-    kinds = [("x", "<f4", 7), ("y", "<f4", 7), ("z", "<f4", 7), ("rgb", "<u4", 7 if is_float else 6)]
+    kinds = [
+        ("x", "<f4", 7),
+        ("y", "<f4", 7),
+        ("z", "<f4", 7),
+        ("rgb", "<u4", 7 if is_float else 6),
+    ]
     kinds += [("intensity", "<f4", 7), ("label", "<u2", 4), ("ring", "u1", 2)]
     rows = np.zeros(COUNT, [entry[:2] for entry in kinds])
     rows["x"], rows["y"], rows["z"] = points_of().T

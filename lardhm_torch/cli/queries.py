@@ -33,10 +33,25 @@ def query(arguments: argparse.Namespace) -> None:
     if points.shape[1] == model.dim + 1 and bool((points[:, -1] == points[:1, -1]).all()):
         points = points[:, :-1]  # flat scans, as `fit --dim 2` takes them
     with torch.no_grad():
-        probability = model(points).float().numpy()
+        if arguments.channel is None:
+            probability = model(points).float().numpy()
+        else:
+            _check_channel(model, arguments.channel)
+            probability = model.channel(points, arguments.channel).float().numpy()
     with replaced_file(arguments.output) as partial, open(partial, "wb") as file:
         np.save(file, probability)
-    print(f"{len(probability)} probabilities -> {arguments.output}")
+    print(f"{len(probability)} {arguments.channel or 'probabilities'} -> {arguments.output}")
+
+
+def _check_channel(model: LardHilbertMap | TiledMap, name: str) -> None:
+    """Raise an error if a map does not have a channel."""
+    from lardhm_torch.maps import channel_names
+
+    names = channel_names(model)
+    if name not in names:
+        raise ValueError(
+            f"--channel must be one of the map, {', '.join(names) or 'none'}; got {name}"
+        )
 
 
 def mesh(arguments: argparse.Namespace) -> None:
@@ -144,6 +159,7 @@ def _check_address(host: str, port: int) -> None:
 
 def render(arguments: argparse.Namespace) -> None:
     """Draw a map to a picture; no display is needed."""
+    from lardhm_torch.surfaces.channel_colors import class_colors
     from lardhm_torch.tiles.tiled_map import open_map
     from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
@@ -156,7 +172,11 @@ def render(arguments: argparse.Namespace) -> None:
         return
     surface = _surface(model, arguments)
     angles = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
-    render_mesh(surface, arguments.output, cut_above=arguments.cut_above, **angles)
+    legend = None
+    if arguments.color == "class":
+        colors = class_colors(sorted(set(surface.vertex_attributes["label"].tolist()) - {-1}))
+        legend = {f"class {number}": rgb for number, rgb in colors.items()}
+    render_mesh(surface, arguments.output, cut_above=arguments.cut_above, legend=legend, **angles)
     print(f"{len(surface.faces)} faces -> {arguments.output}")
 
 
@@ -247,6 +267,10 @@ def _info_of_file(path: str) -> dict[str, Any]:
         "training points": int(model.counts.sum()),
         "origin [m]": model.origin.tolist(),
     }
+    if model.channel_layout:
+        rows["channels"] = list(model.channel_layout)
+    if model.classes:
+        rows["classes"] = model.classes
     if len(model):
         lower, upper = map_bounds(model)
         rows["bounds [m]"] = [[round(float(v), 3) for v in corner] for corner in (lower, upper)]

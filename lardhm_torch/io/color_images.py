@@ -38,9 +38,7 @@ def listed_colors(folder: Path, stamps: list[float]) -> list[Path | None]:
     nearest = np.abs(times[None] - np.array(stamps)[:, None]).argmin(axis=1)
     inside = [not Path(name).is_absolute() and ".." not in Path(name).parts for _, name in rows]
     return [
-        folder / rows[row][1]
-        if inside[row] and abs(times[row] - stamp) <= _MAX_STAMP_GAP
-        else None
+        folder / rows[row][1] if inside[row] and abs(times[row] - stamp) <= _MAX_STAMP_GAP else None
         for row, stamp in zip(nearest.tolist(), stamps, strict=True)
     ]
 

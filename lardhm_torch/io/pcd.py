@@ -139,7 +139,8 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
         is_channel = name.lower() in CHANNEL_COLUMNS and is_number and number == 1
         if name.lower() not in RAY_COLUMNS and not is_channel:  # padding: any type and size
             width = header_count(size, f"SIZE of field {name}")
-            fields.append(Field(name.lower(), f"V{width}", number))
+            known = "" if name.lower() in CHANNEL_COLUMNS else name.lower()  # is not read
+            fields.append(Field(known, f"V{width}", number))
             continue
         if not is_number:
             raise ValueError(f"field {name} has TYPE {kind} and SIZE {size}, which no PCD may have")

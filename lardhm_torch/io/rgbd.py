@@ -133,7 +133,9 @@ def _color_notes(frames: list[_Frame], colors: list[NDArray[np.float32] | None])
     unused = sum(frame.color is not None for frame in frames) - used
     notes = [Note("color images taken as registered to the depth images", used)] if used else []
     if unused:
-        notes.append(Note("color images of another size than the depth images are left out", unused))
+        notes.append(
+            Note("color images of another size than the depth images are left out", unused)
+        )
     return notes
 
 

@@ -30,7 +30,9 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.points import UNKNOWN, as_tensor, inliers, to_map_frame
 
-Layout: TypeAlias = dict[str, Any]  # number of values by name; of classes, the list of their numbers
+Layout: TypeAlias = dict[
+    str, Any
+]  # number of values by name; of classes, the list of their numbers
 MOST_COLUMNS = 1024  # class numbers in one map; more are identifiers of objects, not classes
 
 
@@ -276,7 +278,6 @@ def handed_over(state: MapState, alive: Tensor) -> MapState:
     nearest = native.nearest_centers(state.means[dying], state.means[heirs], 1).squeeze(1)
     sums = state.channel_sums.index_add(0, heirs[nearest], state.channel_sums[dying])
     return replace(state, channel_sums=sums.index_fill(0, dying, 0))
-
 
 
 def moved_sums(sums: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:

@@ -79,7 +79,9 @@ def check_class_points(points: TensorLike, classes: TensorLike, like: Tensor) ->
     values = check_channels({CLASS: given}, len(points))[CLASS]
     rows = (~missing(values)).nonzero().squeeze(1)
     if len(points) and len(rows) == 0:
-        raise ValueError(f"classes must have a value for a point at least; all {len(points)} miss it")
+        raise ValueError(
+            f"classes must have a value for a point at least; all {len(points)} miss it"
+        )
     points, _ = check_samples(points, torch.ones(len(points)), like.shape[1], like.device)
     return ClassPoints(*in_morton_order(points[rows], values[rows]))
 

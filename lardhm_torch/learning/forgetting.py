@@ -73,7 +73,8 @@ def forget(known: MapState, which: Tensor) -> MapState:
     return replace(
         known,
         evidence=first_points(known.evidence, left),
-        channel_sums=known.channel_sums * torch.where(which & (left == 0), 0, fraction)[:, None, None],
+        channel_sums=known.channel_sums
+        * torch.where(which & (left == 0), 0, fraction)[:, None, None],
         counts=counts,
         fresh=fresh,
         scatters=known.scatters * fraction.to(known.scatters)[:, None, None],

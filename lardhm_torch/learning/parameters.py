@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,9 +13,10 @@ from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, no_sums
 from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState
-from lardhm_torch.learning.resizing import extend_channels, resize, set_class_weights
+from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
+AnyMap = TypeVar("AnyMap", bound="MapParameters")
 
 
 class MapParameters(nn.Module):
@@ -141,6 +142,16 @@ class MapParameters(nn.Module):
             {"params": [self.weights], "weight_decay": weight_decay},
             {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
         ]
+
+    def drop_channels(self: AnyMap) -> AnyMap:
+        """Remove channels and classes from the map. The occupancy does not change.
+
+        Returns:
+            This map.
+        """
+        set_channels(self, {}, has_class_weights=False)
+        self.class_scale = 1.0
+        return self
 
     def extra_repr(self) -> str:
         """Number of clusters and settings, for `print(model)`."""

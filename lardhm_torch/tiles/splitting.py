@@ -24,6 +24,11 @@ def split_map(model: LardHilbertMap, folder: Folder, edge: float) -> None:
     folder = Path(folder)
     if len(model) == 0:
         raise ValueError("the map must hold clusters to be split; it is empty: fit it first")
+    if model.channel_layout:
+        raise ValueError(
+            f"tiles cannot hold channels; the map has {', '.join(model.channel_layout)}. "
+            "Split a copy without them: copy.deepcopy(model).drop_channels()"
+        )
     if (folder / MANIFEST_NAME).exists():
         raise FileExistsError(f"{folder} must be a new folder; it holds a tiled map already")
     manifest = Manifest(

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.channels import COLOR
 from lardhm_torch.maps import OccupancyMap, covariance_scale
 from lardhm_torch.queries.grids import query_slice
 from lardhm_torch.scans import Scans
@@ -133,11 +134,16 @@ def painted_glb(mesh: trimesh.Trimesh) -> bytes:
 
 
 def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) hits, at most about ``limit``, and (N, 3) uint8 gray levels by height."""
+    """(N, 3) hits, at most about ``limit``, and (N, 3) uint8 colors: their own, or gray by height."""
     from matplotlib import colormaps
 
-    hits = scans.hits
-    hits = in_space(hits[hits.isfinite().all(dim=1)].cpu())
+    rays = scans.select(scans.is_return & scans.ends.isfinite().all(dim=1))
+    if COLOR in rays.channels and len(rays):
+        rays = rays.select(torch.arange(0, len(rays), -(-len(rays) // limit)))
+        points = (in_space(rays.ends.cpu()).numpy() - offset).astype(np.float32)
+        colors = rays.channels[COLOR].cpu().nan_to_num(nan=0.6)
+        return points, (255 * colors).round().to(torch.uint8).numpy()
+    hits = in_space(rays.ends.cpu())
     points = thinned((hits.numpy() - offset).astype(np.float32), limit)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
