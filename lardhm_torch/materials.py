@@ -18,8 +18,7 @@ COLORS = (
 TILE, DARK = 1.0, 0.75  # [m] edge of the tiles of the floor, and brightness of every other one
 
 # Classes of the shapes, in the order of `simulation.BOXES`, `CYLINDERS` and `SPHERES`.
-_BOXES = ("table",) * 5 + ("chair",) * 24 + ("sofa",) * 4 + ("shelf",) * 7
-_BOXES += ("wall", "cabinet", "cabinet", "cabinet")
+_BOXES = [*["table"] * 5, *["chair"] * 24, *["sofa"] * 4, *["shelf"] * 7, "wall", *["cabinet"] * 3]
 _CYLINDERS = ("column", "table", "table", "lamp", "lamp")
 _SPHERES = ("lamp", "lamp")
 SHAPE_CLASSES = tuple(map(CLASS_NAMES.index, (*_BOXES, *_CYLINDERS, *_SPHERES)))

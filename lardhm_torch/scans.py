@@ -35,7 +35,7 @@ class Scans:
     scan_id: Tensor = field(default=None)  # type: ignore[assignment]
     is_return: Tensor = field(default=None)  # type: ignore[assignment]
     target_index: Tensor = field(default=None)  # type: ignore[assignment]
-    channels: Channels = field(default=None)  # type: ignore[assignment]
+    channels: Channels = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         ends = torch.as_tensor(self.ends, dtype=torch.float64)

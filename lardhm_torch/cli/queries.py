@@ -12,6 +12,7 @@ from lardhm_torch.cli.scan_files import describe_scans, read_scans
 
 if TYPE_CHECKING:
     import trimesh
+    from torch import Tensor
 
     from lardhm_torch import LardHilbertMap, TiledMap
 
@@ -36,15 +37,14 @@ def query(arguments: argparse.Namespace) -> None:
         if arguments.channel is None:
             probability = model(points).float().numpy()
         else:
-            _check_channel(model, arguments.channel)
-            probability = model.channel(points, arguments.channel).float().numpy()
+            probability = _channel(model, points, arguments.channel).float().numpy()
     with replaced_file(arguments.output) as partial, open(partial, "wb") as file:
         np.save(file, probability)
     print(f"{len(probability)} {arguments.channel or 'probabilities'} -> {arguments.output}")
 
 
-def _check_channel(model: LardHilbertMap | TiledMap, name: str) -> None:
-    """Raise an error if a map does not have a channel."""
+def _channel(model: Any, points: Tensor, name: str) -> Tensor:
+    """Values of a channel at (N, D) points, or an error if the map does not have it."""
     from lardhm_torch.maps import channel_names
 
     names = channel_names(model)
@@ -52,6 +52,8 @@ def _check_channel(model: LardHilbertMap | TiledMap, name: str) -> None:
         raise ValueError(
             f"--channel must be one of the map, {', '.join(names) or 'none'}; got {name}"
         )
+    values: Tensor = model.channel(points, name)
+    return values
 
 
 def mesh(arguments: argparse.Namespace) -> None:
@@ -159,6 +161,8 @@ def _check_address(host: str, port: int) -> None:
 
 def render(arguments: argparse.Namespace) -> None:
     """Draw a map to a picture; no display is needed."""
+    import numpy as np
+
     from lardhm_torch.surfaces.channel_colors import class_colors
     from lardhm_torch.tiles.tiled_map import open_map
     from lardhm_torch.viewing.rendering import render_mesh, render_slice
@@ -174,7 +178,8 @@ def render(arguments: argparse.Namespace) -> None:
     angles = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
     legend = None
     if arguments.color == "class":
-        colors = class_colors(sorted(set(surface.vertex_attributes["label"].tolist()) - {-1}))
+        labels = np.unique(np.asarray(surface.vertex_attributes["label"]))
+        colors = class_colors(labels[labels >= 0].tolist())
         legend = {f"class {number}": rgb for number, rgb in colors.items()}
     render_mesh(surface, arguments.output, cut_above=arguments.cut_above, legend=legend, **angles)
     print(f"{len(surface.faces)} faces -> {arguments.output}")

@@ -88,9 +88,8 @@ def _white(values: NDArray) -> float:
 def unpacked_colors(values: NDArray) -> NDArray[np.float32]:
     """(R,) 0x00RRGGBB as integers, or as the bits of float32 -> (R, 3) from 0 to 1."""
     if values.dtype.kind == "f":
-        words = np.ascontiguousarray(values, np.float32).view(np.uint32)
-    else:
-        words = values.astype(np.int64) & 0xFFFFFFFF
+        values = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    words = values.astype(np.int64)
     channels = [(words >> shift) & 0xFF for shift in (16, 8, 0)]
     return np.stack(channels, axis=1).astype(np.float32) / np.float32(255)
 

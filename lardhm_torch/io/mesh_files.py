@@ -39,6 +39,9 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
         raise ValueError(f"path must end in one of {known} for a mesh; got {path.name!r}")
     error = float(np.abs(mesh.vertices - mesh.vertices.astype(np.float32)).max(initial=0.0))
     is_coarse = error > FLOAT32_ERROR
+    if suffix == ".glb":  # has no integer attributes
+        mesh = mesh.copy()
+        mesh.vertex_attributes.clear()
     with replaced_file(path) as partial:
         if is_coarse and suffix == ".ply":
             partial.write_bytes(_float64_ply(mesh))

@@ -90,7 +90,7 @@ def _channel_arrays(archive: zipfile.ZipFile) -> list[str]:
 
 def _channels_of(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     """The channels among arrays, with bytes of colors divided by 255."""
-    count, found = len(columns["points"]), {}
+    count, found = len(columns["points"]), dict[str, NDArray]()
     for name, values in columns.items():
         if name not in _CHANNELS and not name.startswith(_PREFIX):
             continue

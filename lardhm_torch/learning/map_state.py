@@ -101,14 +101,14 @@ def new_rows(
     if evidence is None:
         evidence = no_evidence(clusters.means)
     raw = raw_factors(factors)
-    zeros = (weights.clone() for _ in range(3))
+    zeros = (weights.clone(), weights.clone(), weights.clone())
     moments = (clusters.counts, clusters.means, clusters.scatters)
     dim = clusters.means.shape[1]
-    none = (
-        weights.new_zeros(len(weights), 0, 1 + dim, dtype=torch.float64),
-        weights.new_zeros(len(weights), 0),
+    no_sums = weights.new_zeros(len(weights), 0, 1 + dim, dtype=torch.float64)
+    no_classes = weights.new_zeros(len(weights), 0)
+    return MapState(
+        weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, no_sums, no_classes
     )
-    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, *none)
 
 
 def no_evidence(means: Tensor) -> Tensor:

@@ -37,7 +37,8 @@ def class_colors(classes: Sequence[int]) -> dict[int, tuple[int, int, int]]:
 
     table = colormaps["tab20"](np.arange(20), bytes=True)[:, :3]
     table = np.concatenate([table[::2], table[1::2]])  # strong colors first
-    return {number: tuple(map(int, table[number % 20])) for number in classes}
+    rows = table.tolist()
+    return {number: (*rows[number % 20],) for number in classes}
 
 
 def channel_colors(model: OccupancyMap, vertices: np.ndarray, name: str) -> np.ndarray:

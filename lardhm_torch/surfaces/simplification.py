@@ -59,6 +59,6 @@ def simplify_mesh(mesh: trimesh.Trimesh, num_faces: int) -> trimesh.Trimesh:
         vertices,
         faces,
         vertex_colors=visual.vertex_colors[nearest] if has_colors else None,
-        vertex_attributes={name: values[nearest] for name, values in attributes.items()},
+        vertex_attributes={name: np.asarray(v)[nearest] for name, v in attributes.items()},
         process=False,
     )

@@ -104,7 +104,10 @@ def _with_legend(image: np.ndarray, legend: Mapping[str, tuple[int, int, int]]) 
     axes = figure.add_axes((0, 0, 1, 1))
     axes.imshow(image, aspect="auto", interpolation="nearest")
     axes.set_axis_off()
-    patches = [Patch(color=np.array(rgb) / 255, label=text) for text, rgb in legend.items()]
+    patches = [
+        Patch(color=(rgb[0] / 255, rgb[1] / 255, rgb[2] / 255), label=text)
+        for text, rgb in legend.items()
+    ]
     axes.legend(handles=patches, loc="upper right", framealpha=0.9)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[:height, :width, :3].copy()
