@@ -134,7 +134,7 @@ class LardHilbertMap(MapQueries):
         Args:
             points: (N, D) world positions.
             classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
-            num_clusters: number of clusters of an empty map; None: one per 15 points of a class.
+            num_clusters: number of clusters of an empty map; None: one per 30 points of a class.
             seed: random seed of clustering and training.
             wrong_labels: fraction of the labels that are those of a random other class. The map then
                 answers for the true class.

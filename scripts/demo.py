@@ -46,7 +46,9 @@ def main(folder: Path) -> None:
         print(format_metrics(evaluate(model, test)))
         classes = model.class_probability(test.hits).argmax(dim=-1)
     labels = test.channels["class"][test.is_return]
-    print(f"classes: {(classes == labels).float().mean():.3f} of the labels, of which 5 % are wrong")
+    print(
+        f"classes: {(classes == labels).float().mean():.3f} of the labels, of which 5 % are wrong"
+    )
     mesh = extract_mesh(model, resolution=0.05, color="color", progress=True)
     save_mesh(mesh, folder / "mesh.ply")
     scores = mesh_metrics(mesh, room_mesh(), train.hits)

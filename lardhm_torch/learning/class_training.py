@@ -27,7 +27,6 @@ from lardhm_torch.learning.channel_sums import (
 )
 from lardhm_torch.learning.clustering import (
     MAX_CHOSEN,
-    POINTS_PER_CLUSTER,
     cluster_points,
     concatenate_clusters,
     points_where,
@@ -38,6 +37,8 @@ from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.native import nearest_centers
 from lardhm_torch.points import as_tensor, check_samples, in_morton_order, to_map_frame
+
+CLASS_POINTS = 30  # per cluster of a class: classes overlap more than surfaces and free space
 
 
 class ClassSamples(NamedTuple):
@@ -97,7 +98,7 @@ def clustered(
 
     Args:
         labelled: N points; one with probabilities belongs to its most likely class.
-        num_clusters: total, divided in proportion to the points; None: one per 15 points of a class.
+        num_clusters: total, divided in proportion to the points; None: one per 30 points of a class.
         kernel: minimum length-scale.
         like: (M, D) tensor of the map.
         rng: random generator.
@@ -111,7 +112,7 @@ def clustered(
     parts = []
     for number in owners.unique().tolist():
         (members,) = in_morton_order(points_where(points, owners == number))
-        wanted = len(members) // POINTS_PER_CLUSTER
+        wanted = len(members) // CLASS_POINTS
         if num_clusters is not None:
             wanted = round(num_clusters * len(members) / len(points))
         parts.append(cluster_points(members, max(1, min(wanted, MAX_CHOSEN)), rng))

@@ -138,27 +138,26 @@ def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarra
     from matplotlib import colormaps
 
     rays = scans.select(scans.is_return & scans.ends.isfinite().all(dim=1))
-    if COLOR in rays.channels and len(rays):
-        rays = rays.select(torch.arange(0, len(rays), -(-len(rays) // limit)))
-        points = (in_space(rays.ends.cpu()).numpy() - offset).astype(np.float32)
-        colors = rays.channels[COLOR].cpu().nan_to_num(nan=0.6)
+    points = (in_space(rays.ends.cpu()).numpy() - offset).astype(np.float32)
+    rows = thinned_rows(points, limit)
+    points = points[rows]
+    if COLOR in rays.channels:
+        colors = rays.channels[COLOR].cpu()[torch.from_numpy(rows)].nan_to_num(nan=0.6)
         return points, (255 * colors).round().to(torch.uint8).numpy()
-    hits = in_space(rays.ends.cpu())
-    points = thinned((hits.numpy() - offset).astype(np.float32), limit)
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
     return points, colormaps["gray"](shades, bytes=True)[:, :3]
 
 
-def thinned(points: np.ndarray, limit: int) -> np.ndarray:
-    """At most ``limit`` of (N, 3) points: the first in each voxel, with voxels as large as needed."""
+def thinned_rows(points: np.ndarray, limit: int) -> np.ndarray:
+    """Ascending rows of at most ``limit`` points: the first in each voxel, as large as needed."""
     kept, edge = np.arange(len(points)), 0.01
     while len(kept) > limit:
         cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
         sides = cells.max(axis=0) + 1
         kept = np.unique(np.ravel_multi_index(cells.T, sides), return_index=True)[1]
         edge *= max(1.02, (len(kept) / limit) ** 0.4)  # on surfaces the count goes with edge^-2
-    return points[np.sort(kept)]
+    return np.sort(kept)
 
 
 def quaternions(rotations: np.ndarray) -> np.ndarray:
