@@ -12,6 +12,7 @@ from small_maps import F64, same_map, wall
 from lardhm_torch import (
     LardHilbertMap,
     TiledMap,
+    channel,
     extract_mesh,
     features,
     merge_maps,
@@ -361,6 +362,14 @@ def test_dropped_channels_leave_the_map_without_them(tmp_path):
     bare = LardHilbertMap(3).double().fit(*wall(), 40)
     assert same_map(model.drop_channels(), bare)
     TiledMap.split(model, tmp_path / "tiles", 5.0)
+
+
+def test_the_function_answers_as_the_map_does():
+    model, points = colored_map(), surface_points()
+    assert torch.equal(channel(model, points, "color"), model.channel(points, "color"))
+    assert torch.equal(channel(model, points, "class"), model.class_probability(points))
+    with pytest.raises(ValueError, match="color, intensity, class; got 'infrared'"):
+        channel(model, points, "infrared")
 
 
 def test_a_map_without_a_channel_names_those_it_has():

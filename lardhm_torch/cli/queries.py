@@ -12,8 +12,6 @@ from lardhm_torch.cli.scan_files import describe_scans, read_scans
 
 if TYPE_CHECKING:
     import trimesh
-    from torch import Tensor
-
     from lardhm_torch import LardHilbertMap, TiledMap
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
@@ -26,6 +24,7 @@ def query(arguments: argparse.Namespace) -> None:
 
     from lardhm_torch.io.atomic_files import replaced_file
     from lardhm_torch.io.scan_files import load_points
+    from lardhm_torch.queries.channels import channel
     from lardhm_torch.tiles.tiled_map import open_map
 
     check_output(arguments.output, (".npy",), [arguments.map, arguments.points])
@@ -37,23 +36,10 @@ def query(arguments: argparse.Namespace) -> None:
         if arguments.channel is None:
             probability = model(points).float().numpy()
         else:
-            probability = _channel(model, points, arguments.channel).float().numpy()
+            probability = channel(model, points, arguments.channel).float().numpy()
     with replaced_file(arguments.output) as partial, open(partial, "wb") as file:
         np.save(file, probability)
     print(f"{len(probability)} {arguments.channel or 'probabilities'} -> {arguments.output}")
-
-
-def _channel(model: Any, points: Tensor, name: str) -> Tensor:
-    """Values of a channel at (N, D) points, or an error if the map does not have it."""
-    from lardhm_torch.maps import channel_names
-
-    names = channel_names(model)
-    if name not in names:
-        raise ValueError(
-            f"--channel must be one of the map, {', '.join(names) or 'none'}; got {name}"
-        )
-    values: Tensor = model.channel(points, name)
-    return values
 
 
 def mesh(arguments: argparse.Namespace) -> None:
