@@ -12,6 +12,7 @@ from lardhm_torch.cli.scan_files import describe_scans, read_scans
 
 if TYPE_CHECKING:
     import trimesh
+
     from lardhm_torch import LardHilbertMap, TiledMap
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
