@@ -21,6 +21,7 @@ from lardhm_torch.learning import (
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.map_state import HISTORY
+from lardhm_torch.learning.state_dicts import occupied_sums
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
@@ -343,7 +344,7 @@ class LardHilbertMap(MapQueries):
         state = self.state_dict()
         if not evidence:
             state = {name: value for name, value in state.items() if name not in HISTORY}
-        map_files.save_state(state, path)
+        map_files.save_state(occupied_sums(state), path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:

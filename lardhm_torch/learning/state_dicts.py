@@ -39,6 +39,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
         name: tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
         for name, tensor in own.items()
     }
+    _spread_sums(state, prefix, num_clusters)
     layout, own_shapes = _channel_shapes(state, prefix, model.dim)
     shapes.update({name: (num_clusters, *shape) for name, shape in own_shapes.items()})
     for name, shape in shapes.items():
@@ -68,6 +69,24 @@ def _channel_shapes(
         "class_weights": (len(layout.get(CLASS, ())),),
     }
     return layout, {name: shapes[name] for name in present}
+
+
+def occupied_sums(state: dict[str, Any]) -> dict[str, Any]:
+    """The state dict of a map with the channel sums of its occupied clusters alone: others have none."""
+    if "channel_sums" not in state:
+        return state
+    return {**state, "channel_sums": state["channel_sums"][state["is_occupied"]]}
+
+
+def _spread_sums(state: dict[str, Any], prefix: str, num_clusters: int) -> None:
+    """Undo `occupied_sums` in the state dict of a file."""
+    sums, rows = state.get(prefix + "channel_sums"), state[prefix + "is_occupied"]
+    if not isinstance(sums, Tensor) or sums.ndim != 3 or rows.dtype != torch.bool:
+        return
+    if len(rows) == num_clusters and len(sums) == int(rows.sum()) < num_clusters:
+        spread = sums.new_zeros(num_clusters, *sums.shape[1:])
+        spread[rows] = sums
+        state[prefix + "channel_sums"] = spread
 
 
 def _class_scale(state: dict[str, Any], prefix: str) -> float:
