@@ -192,7 +192,7 @@ def first_shapes(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     Boxes, cylinders and spheres are numbered in this order; -1 is the shell.
     """
     ranges = _shell_ranges(origins, directions)
-    shapes = torch.full(ranges.shape, -1)
+    shapes = torch.full(ranges.shape, -1, device=ranges.device)
     for number, (near, is_hit) in enumerate(_shape_ranges(origins, directions)):
         shapes[is_hit & (near < ranges)] = number
         ranges = torch.where(is_hit, torch.minimum(ranges, near), ranges)

@@ -77,11 +77,6 @@ def _npz_piece(columns: dict[str, NDArray], origins: NDArray | None) -> Readout:
     )
 
 
-def channel_arrays(channels: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Channels as arrays of an archive, by the names that the readers look for."""
-    return {n if n in _CHANNELS else _PREFIX + n: values for n, values in channels.items()}
-
-
 def _channel_arrays(archive: zipfile.ZipFile) -> list[str]:
     """Names of the arrays that are channels."""
     names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
@@ -153,14 +148,17 @@ def read_npy(path: Path) -> Readout:
     return Readout(_coordinates(array, "the array"))
 
 
-def write_npz(path: Path, arrays: dict[str, NDArray]) -> None:
-    """Write arrays to path in one step.
+def write_npz(
+    path: Path, arrays: Mapping[str, NDArray], channels: Mapping[str, NDArray] | None = None
+) -> None:
+    """Write arrays, and channels by the names that the readers look for, to path in one step.
 
     Raises:
         FileNotFoundError: the folder does not exist.
     """
+    named = {n if n in _CHANNELS else _PREFIX + n: v for n, v in (channels or {}).items()}
     with replaced_file(path) as partial, open(partial, "wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, allow_pickle=False, **arrays, **named)
 
 
 def _points_of(archive: zipfile.ZipFile) -> NDArray[np.float64]:

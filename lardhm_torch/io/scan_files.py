@@ -44,14 +44,7 @@ from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import las_pieces, read_las
 from lardhm_torch.io.moving_sensor import seen_from_track
 from lardhm_torch.io.notes import ScanReport, check_notes, no_ray_left
-from lardhm_torch.io.numpy_files import (
-    channel_arrays,
-    npz_pieces,
-    read_npy,
-    read_npz,
-    read_npz_points,
-    write_npz,
-)
+from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
 from lardhm_torch.io.origins import note_not_finite, scans_from, unused_origin, with_origins
 from lardhm_torch.io.paths import expand_paths, naming_errors
 from lardhm_torch.io.pcd import read_pcd
@@ -329,7 +322,7 @@ def save_scans(scans: Scans, path: PathLike) -> None:
     }
     arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
     channels = {name: value.cpu().numpy() for name, value in scans.channels.items()}
-    write_npz(target, {**arrays, **channel_arrays(channels)})
+    write_npz(target, arrays, channels)
 
 
 def load_points(path: PathLike) -> Tensor:
