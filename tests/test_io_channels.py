@@ -255,3 +255,18 @@ def test_float_colors_that_are_no_numbers_are_missing():
     colors = scaled_colors(values)
     assert np.isnan(colors[0]).all()
     np.testing.assert_allclose(colors[1], [0, 0.25, 1])
+
+
+def test_a_report_counts_the_rays_that_have_a_value(tmp_path):
+    from lardhm_torch import ScanReport
+
+    color = np.full((4, 3), 0.5)
+    color[1] = np.nan
+    arrays = {"points": np.ones((4, 3)), "origins": np.zeros((1, 3))}
+    np.savez(tmp_path / "a.npz", **arrays, color=color)
+    np.savez(tmp_path / "b.npz", **arrays)  # without a channel
+    report = ScanReport()
+    scans = load_scans(tmp_path, report=report)
+    assert report.channels == {"color": 3}
+    assert "color of 3 rays" in str(report)
+    assert int(scans.channels["color"].isnan().any(dim=1).sum()) == 5
