@@ -59,8 +59,8 @@ class LardHilbertMap(MapQueries):
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
-        channels: sums of color, intensity, other values and classes by name (`ChannelSums`), in a map
-            that was given `channels`. They are columns of the buffer ``channel_sums`` (M, W), float64.
+        channel_sums: (M, R, 1 + D) float64 buffer of a map that was given channels, else None; what
+            `channels` shows by name.
         class_weights: (M, K) parameter of a map whose classes were trained (`fit_classes`), else None.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
