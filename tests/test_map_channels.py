@@ -40,8 +40,8 @@ def channels_of(points, labels):
     }
 
 
-def colored_wall(seed=0, at=1.0, count=600):
-    points, labels = wall(count, seed=seed, at=at)
+def colored_wall(count=600, seed=0):
+    points, labels = wall(count, seed=seed)
     return points, labels, channels_of(points, labels)
 
 
@@ -143,7 +143,8 @@ def test_the_native_mixture_equals_the_definition():
 
 
 def test_channels_and_classes_are_differentiable():
-    model = colored_map(num_neighbors=5)
+    points, labels, channels = colored_wall(100)
+    model = LardHilbertMap(3, 5).double().fit(points, labels, 12, channels=channels)
     model.class_weights = torch.nn.Parameter(0.1 * torch.ones(len(model), 2, dtype=F64))
     points = surface_points(4).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda x: model.channel(x, "intensity"), points)
