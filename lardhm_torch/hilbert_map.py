@@ -18,6 +18,7 @@ from lardhm_torch.learning import (
     parameters,
     posterior,
 )
+from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.map_state import HISTORY
@@ -34,7 +35,8 @@ class LardHilbertMap(MapQueries):
 
     The probability is exactly 1/2 in an empty map and far from all clusters. Points are
     given in the world frame; ``origin`` is subtracted in float64 before they are cast to the map's
-    dtype, so coordinates may be far from zero. A point with a NaN or infinite coordinate has
+    dtype, so coordinates may be far from zero. Maps of half precision answer in their dtype and compute
+    in float32; they cannot be trained. A point with a NaN or infinite coordinate has
     probability NaN. Tensors, NumPy arrays and lists are accepted as points.
 
     Args:
@@ -66,6 +68,7 @@ class LardHilbertMap(MapQueries):
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
     """
 
+    @changes_map
     def fit(
         self,
         points: TensorLike,
@@ -114,6 +117,7 @@ class LardHilbertMap(MapQueries):
         self.class_scale = 1.0
         return self
 
+    @changes_map
     @torch.no_grad()
     def fit_classes(
         self,
@@ -175,6 +179,7 @@ class LardHilbertMap(MapQueries):
             self.posterior_means, self.posterior_variances, self.posterior_scales = kept
         return self
 
+    @changes_map
     @torch.no_grad()
     def calibrate_classes(
         self, points: TensorLike, classes: TensorLike, *, wrong_labels: float = 0.0
@@ -204,6 +209,7 @@ class LardHilbertMap(MapQueries):
         self.class_scale = class_training.best_scale(log_odds, targets, wrong_labels)
         return self
 
+    @changes_map
     @torch.no_grad()
     def fit_uncertainty(self, points: TensorLike, labels: TensorLike) -> LardHilbertMap:
         """Estimate the variance of the weights, for `variance` and `bayesian_probability`.
@@ -229,6 +235,7 @@ class LardHilbertMap(MapQueries):
         self.posterior_means, self.posterior_variances, self.posterior_scales = found
         return self
 
+    @changes_map
     def update(
         self,
         points: TensorLike,
@@ -283,6 +290,7 @@ class LardHilbertMap(MapQueries):
         parameters.write_rows(self, changes.where, part, changes.removed, layout)
         return self
 
+    @changes_map
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
         """Apply the rigid transform x -> rotation x + translation to the map.
 
@@ -300,11 +308,11 @@ class LardHilbertMap(MapQueries):
             ValueError: wrong shapes, or rotation is not a rotation.
         """
         state = parameters.read_state(self)
-        kept = self._copied_posterior(slice(None))
-        parameters.write_state(self, *map_merging.moved(state, self.origin, rotation, translation))
-        self.posterior_means, self.posterior_variances, self.posterior_scales = kept
+        state, origin = map_merging.moved(state, self.origin, rotation, translation)
+        map_merging.replace_clusters(self, state, origin, slice(None))
         return self
 
+    @changes_map
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
@@ -320,15 +328,8 @@ class LardHilbertMap(MapQueries):
         center = map_merging.check_sphere(center, radius, self.origin)
         state = parameters.read_state(self)
         rows = map_merging.within(state, center - self.origin, radius, self.kernel)
-        kept = self._copied_posterior(rows)
-        parameters.write_state(self, state.rows(rows), self.origin)
-        self.posterior_means, self.posterior_variances, self.posterior_scales = kept
+        map_merging.replace_clusters(self, state.rows(rows), self.origin, rows)
         return self
-
-    def _copied_posterior(self, rows: Tensor | slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Posterior of some weights, which stays valid where these keep their features."""
-        means, variances = self.posterior_means[rows], self.posterior_variances[rows]
-        return means.clone(), variances.clone(), self.posterior_scales.clone()
 
     # --- files ---
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import fields
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -11,12 +13,17 @@ from torch import Tensor, nn
 
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
+from lardhm_torch.learning.changes import normal_tensors
 from lardhm_torch.learning.channel_sums import Layout, no_sums
 from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
+from lardhm_torch.learning.state_checks import check_settings
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
+
+# OpenMP hangs in the child of a fork whose parent used it; DataLoader workers have one thread, too.
+os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 class MapParameters(nn.Module):
@@ -59,7 +66,8 @@ class MapParameters(nn.Module):
         self.num_neighbors = num_neighbors
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
-        self._register_empty(dim, device, dtype)
+        with normal_tensors():
+            self._register_empty(dim, device, dtype)
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
         self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
         self._index = torch.empty(0, dtype=torch.uint8)
@@ -111,7 +119,7 @@ class MapParameters(nn.Module):
     @property
     def scale_tril(self) -> Tensor:
         """(M, D, D) lower Cholesky factors of the kernels [m], settings of the kernel applied."""
-        return kernel_factors(self.raw_scale_tril, self.kernel)
+        return kernel_factors(at_least_float32(self.raw_scale_tril), self.kernel)
 
     @property
     def kernel(self) -> Kernel:
@@ -171,11 +179,17 @@ class MapParameters(nn.Module):
     def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
         """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""
         exact = {"origin": self.origin, "channel_sums": self.channel_sums}
-        super()._apply(fn, recurse)
+        with normal_tensors():
+            super()._apply(fn, recurse)
         for name, tensor in exact.items():
             if tensor is not None and getattr(self, name).dtype != torch.float64:
                 setattr(self, name, tensor.to(getattr(self, name).device))
         return self
+
+
+def at_least_float32(tensor: Tensor) -> Tensor:
+    """The tensor itself, or a float32 copy of one of half precision: maps never compute in that."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def read_state(model: MapParameters) -> MapState:
@@ -304,17 +318,3 @@ def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> 
                 )
             room = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
             optimizer.state[parameter][name] = torch.cat([value, room])
-
-
-def check_settings(
-    dim: int, num_neighbors: int, covariance_scale: float, min_lengthscale: float
-) -> None:
-    """Raise a ValueError if a setting of a map is out of range."""
-    for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
-    if not covariance_scale > 0 or not min_lengthscale > 0:
-        raise ValueError(
-            "covariance_scale and min_lengthscale must be > 0; "
-            f"got {covariance_scale} and {min_lengthscale}"
-        )

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lardhm_torch.channels import CLASS
+from lardhm_torch.learning.changes import normal_tensors
 from lardhm_torch.learning.channel_sums import Layout, conformed, no_sums
 from lardhm_torch.learning.map_state import PER_MAP
 
@@ -28,14 +29,15 @@ def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> No
     """
     if len(model) == num_clusters:
         return
-    for name, tensor in list(model.state_tensors()):
-        if name in PER_MAP:
-            continue
-        room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
-        if isinstance(tensor, nn.Parameter):
-            _set_shape(tensor, room)
-        else:
-            setattr(model, name, room)
+    with normal_tensors():
+        for name, tensor in list(model.state_tensors()):
+            if name in PER_MAP:
+                continue
+            room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
+            if isinstance(tensor, nn.Parameter):
+                _set_shape(tensor, room)
+            else:
+                setattr(model, name, room)
 
 
 def _zeros(tensor: Tensor, rows: int) -> Tensor:

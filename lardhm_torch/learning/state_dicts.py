@@ -13,6 +13,7 @@ from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
 from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
 from lardhm_torch.learning.resizing import resize, set_channels
+from lardhm_torch.learning.state_checks import check_values
 
 if TYPE_CHECKING:
     from lardhm_torch.learning.parameters import MapParameters
@@ -48,6 +49,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
                 f"got {tuple(state[prefix + name].shape)}"
             )
+    check_values({name: state[prefix + name] for name in own})
     resize(model, num_clusters)
     model.class_scale = _class_scale(state, prefix)
     set_channels(model, layout, has_class_weights="class_weights" in own_shapes)
