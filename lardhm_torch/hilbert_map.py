@@ -156,7 +156,10 @@ class LardHilbertMap(MapQueries):
         class_training.check_wrong_labels(wrong_labels)
         rng = seeded_generator(seed, "fit_classes", self.centers.device)
         labelled = class_training.check_class_points(points, classes, self.centers)
-        kept = self._copied_posterior(slice(None))
+        kept = [
+            getattr(self, name).clone()
+            for name in ("posterior_means", "posterior_variances", "posterior_scales")
+        ]
         if len(self) == 0:
             found = class_training.clustered(labelled, num_clusters, self.kernel, self.centers, rng)
         else:
