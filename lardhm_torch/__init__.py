@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.queries.bodies import body_distance as body_distance
     from lardhm_torch.queries.bodies import capsule_distance as capsule_distance
     from lardhm_torch.queries.bodies import collision_probability as collision_probability
+    from lardhm_torch.queries.channels import channel as channel
     from lardhm_torch.queries.clearance import clearance as clearance
     from lardhm_torch.queries.collision import Mover as Mover
     from lardhm_torch.queries.collision import expected_range as expected_range
@@ -75,6 +76,7 @@ _NAMES = {
         "capsule_distance",
         "collision_probability",
     ],
+    "queries.channels": ["channel"],
     "queries.clearance": ["clearance"],
     "queries.collision": ["Mover", "expected_range", "free_probability", "segment_hazard"],
     "queries.distance": ["signed_distance", "surface_distance"],

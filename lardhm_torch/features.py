@@ -266,3 +266,39 @@ def log_odds(
         total = (values * weights[indices]).sum(dim=1)
         chunks.append(total.where(chunk.isfinite().all(dim=1), total.new_tensor(torch.nan)))
     return torch.cat(chunks)
+
+
+def mixture(
+    points: Tensor,
+    centers: Tensor,
+    scale_tril: Tensor,
+    table: Tensor,
+    indices: Tensor,
+    *,
+    sharp: bool,
+) -> Tensor:
+    """Sums of affine functions over the neighbors of each point, weighted by the features.
+
+    The functions of cluster m are t_mc + g_mc . (x - c_m).
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m].
+        scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
+        table: (M, C, 1 + D) values t and gradients g [1/m], or (M, C, 1) values alone.
+        indices: (N, K) the K nearest clusters of each point.
+        sharp: weight by the fourth power of the features, whose kernel has half the length-scales.
+
+    Returns:
+        (N, C) sums; NaN for points that are not finite.
+    """
+    values = lard_kernel(points, centers, scale_tril, indices)
+    values = values * neighbor_fade(points, centers, indices)
+    if sharp:
+        values = values.square().square()
+    answers = table[indices]  # (N, K, C, 1 + D)
+    if table.shape[2] > 1:  # the center only is where the function is written down
+        offsets = points[:, None] - centers.detach()[indices]
+        answers = answers[..., :1] + answers[..., 1:] @ offsets[..., None]
+    total = (values[:, :, None] * answers[..., 0]).sum(dim=1)
+    return total.where(points.isfinite().all(dim=1, keepdim=True), total.new_tensor(torch.nan))

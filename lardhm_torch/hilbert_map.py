@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import copy
 import os
-from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
-from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
+from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
-from lardhm_torch.learning import map_merging, parameters, posterior
-from lardhm_torch.learning.changes import changes_map, normal_tensors
+from lardhm_torch.learning import (
+    channel_sums,
+    class_training,
+    map_merging,
+    parameters,
+    posterior,
+)
+from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
-from lardhm_torch.learning.parameters import at_least_float32
+from lardhm_torch.learning.map_state import HISTORY
+from lardhm_torch.learning.state_dicts import occupied_sums
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
+from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.native.surfaces import NativeMap
-from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame, training_points
+from lardhm_torch.points import training_points
 from lardhm_torch.sampling import seeded_generator
 
 
-class LardHilbertMap(parameters.MapParameters):
+class LardHilbertMap(MapQueries):
     """Continuous occupancy map whose log-odds are a weighted sum of local kernel features.
 
     The probability is exactly 1/2 in an empty map and far from all clusters. Points are
@@ -55,159 +61,12 @@ class LardHilbertMap(parameters.MapParameters):
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
+        channel_sums: (M, R, 1 + D) float64 buffer of a map that was given channels, else None; what
+            `channels` shows by name.
+        class_weights: (M, K) parameter of a map whose classes were trained (`fit_classes`), else None.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
     """
-
-    # --- queries ---
-
-    def forward(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
-        return self._query(points, probability=True)
-
-    def log_odds(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
-        return self._query(points, probability=False)
-
-    def features(self, points: TensorLike) -> Tensor:
-        """(N, D) world positions [m] -> sparse COO (N, M) with K values per row, eq. (9)."""
-        local = self._to_map_frame(points)
-        if local.ndim != 2:
-            raise ValueError(f"points must be (N, {self.dim}); got {tuple(local.shape)}")
-        centers = at_least_float32(self.centers)
-        indices = native.nearest_centers(local, centers, self.num_neighbors, self._fresh_index())
-        values = lard_kernel(local, centers, self.scale_tril, indices)
-        values = values * neighbor_fade(local, centers, indices)
-        return feature_matrix(indices, self._as_answer(values), len(self))
-
-    def variance(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) variance of the log-odds.
-
-        Far from all clusters it equals the variance of the prior.
-
-        Raises:
-            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
-        """
-        return self._as_answer(self._posterior(points)[1])
-
-    def bayesian_probability(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
-
-        Raises:
-            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
-        """
-        mean, variance = self._posterior(points)
-        return self._as_answer(posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance))
-
-    @torch.no_grad()
-    def unknown(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) degree to which space is unobserved, 0 to 1.
-
-        The value is 1 minus the largest feature among clusters of occupied or free points. Where the
-        probability is near 1/2, values near 0 indicate contradictory data, values near 1 no data.
-        """
-        local = self._to_map_frame(points)
-        flat = local.reshape(-1, self.dim)
-        if len(self) == 0:
-            return torch.ones_like(flat[:, 0]).reshape(local.shape[:-1])
-        parts = [flat.new_ones(0)]
-        for chunk in flat.split(posterior.QUERY_CHUNK):
-            indices, values = self._nearest_features(chunk)
-            seen = torch.where(self.counts[indices] > 0, values, 0 * values)  # NaN stays NaN
-            parts.append(1 - seen.amax(dim=1))
-        return self._as_answer(torch.cat(parts)).reshape(local.shape[:-1])
-
-    @torch.no_grad()
-    def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """Probability or log-odds at all points of a lattice, faster than one by one.
-
-        Args:
-            axes: D lists of world coordinates [m]; the lattice is their Cartesian product.
-            probability: True: return the probability; False: return the log-odds.
-
-        Returns:
-            (len(axes[0]), len(axes[1]), ...) values without gradient.
-        """
-        check_axes(axes, self.dim)
-        tensors, index = self._tensors(), self._fresh_index()
-        pairs, dtype = zip(axes, self.origin, strict=True), tensors[0].dtype
-        local = [to_map_frame(axis, shift, dtype) for axis, shift in pairs]
-        answer = native.lattice_occupancy(local, *tensors, probability=probability, index=index)
-        return self._as_answer(answer)
-
-    def native_map(self) -> NativeMap | None:
-        """The tensors of the map for the native library; None if it does not support this map."""
-        if len(self) == 0 or not native.supports(self.centers):
-            return None
-        tensors = (self.centers.detach(), self.raw_scale_tril.detach(), self.weights.detach())
-        return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
-
-    @torch.no_grad()
-    def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
-        """`raycasting.raycast` in the native library; None if it does not support this map.
-
-        Args:
-            origins: (R, D) world positions, float64 [m].
-            directions: (R, D) unit vectors, float64.
-            march: parameters of `native.raycast`.
-        """
-        found = self.native_map()
-        if found is None:
-            return None
-        rays = (origins - self.origin, directions)
-        return native.raycast(rays, march, found[:3], found.kernel, found.center_index)
-
-    def _query(self, points: TensorLike, probability: bool) -> Tensor:
-        local = self._to_map_frame(points)
-        flat, index = local.reshape(-1, self.dim), self._fresh_index()
-        answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
-        return self._as_answer(answer).reshape(local.shape[:-1])
-
-    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
-        centers, raw = at_least_float32(self.centers), at_least_float32(self.raw_scale_tril)
-        return centers, raw, at_least_float32(self.weights), self.kernel
-
-    def _as_answer(self, values: Tensor) -> Tensor:
-        return values.to(self.centers.dtype)
-
-    def _posterior(self, points: TensorLike) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the log-odds at (..., D) points."""
-        if not bool((self.posterior_variances > 0).all()) or len(self) == 0:
-            raise RuntimeError(
-                "variance needs the posterior of every weight; "
-                "call fit_uncertainty(points, labels) first, and again after update"
-            )
-        local = self._to_map_frame(points)
-        own = (self.posterior_means, self.posterior_variances, self.posterior_scales)
-        flat = local.reshape(-1, self.dim)
-        answer = posterior.predict(self._nearest_features, flat, posterior.Posterior(*own))
-        mean, variance = (values.reshape(local.shape[:-1]) for values in answer)
-        return mean, variance
-
-    def _nearest_features(self, local: Tensor) -> tuple[Tensor, Tensor]:
-        centers, raw, *_ = self._tensors()
-        index = self._fresh_index()
-        return native.nearest_features(local, centers.detach(), raw.detach(), self.kernel, index)
-
-    def _fresh_index(self) -> Tensor:
-        """Index of the neighbor search. It is rebuilt if the centers have changed."""
-        # The operators check the index themselves; the transforms of torch.func do not use it.
-        if torch.compiler.is_compiling() or native.transformed():
-            return self._index
-        centers = at_least_float32(self.centers)
-        known = native.index_matches(self._index, centers, self.num_neighbors)
-        if not known or self._index.is_inference():
-            with normal_tensors():
-                self._index = native.build_index(centers, self.num_neighbors)
-        return self._index
-
-    def _to_map_frame(self, points: TensorLike) -> Tensor:
-        points = as_tensor(points, "points", self.origin.device)
-        check_points(points, self.dim)
-        dtype = torch.promote_types(self.centers.dtype, torch.float32)
-        return to_map_frame(points, self.origin, dtype)
-
-    # --- learning ---
 
     @changes_map
     def fit(
@@ -217,6 +76,7 @@ class LardHilbertMap(parameters.MapParameters):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
+        channels: Channels | None = None,
         progress: bool = False,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
@@ -232,6 +92,8 @@ class LardHilbertMap(parameters.MapParameters):
                 leaves the remainder to the other. None: chosen from the data
                 (`clustering.choose_num_clusters`).
             seed: random seed of clustering and training.
+            channels: values of the points by name, such as `Samples.channels`; those of the occupied
+                points are summed up in the clusters. They do not change the occupancy.
             progress: show a progress bar on a terminal.
             config: training settings of the weights.
 
@@ -239,17 +101,115 @@ class LardHilbertMap(parameters.MapParameters):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points, or
-                num_clusters is not a positive integer.
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points,
+                num_clusters is not a positive integer, or a channel is invalid.
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
+        channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "fit", self.centers.device)
         task = FitTask(self.kernel, config or FitConfig(), rng, progress)
         state = fit_clusters(samples.points, samples.labels, num_clusters, task)
-        parameters.write_state(self, state, samples.origin)
+        state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
+        parameters.write_state(self, state, samples.origin, layout)
+        self.class_scale = 1.0
+        return self
+
+    @changes_map
+    @torch.no_grad()
+    def fit_classes(
+        self,
+        points: TensorLike,
+        classes: TensorLike,
+        num_clusters: int | None = None,
+        *,
+        seed: int = 0,
+        wrong_labels: float = 0.0,
+        config: FitConfig | None = None,
+    ) -> LardHilbertMap:
+        """Train ``class_weights`` on labelled points by the multinomial log-loss.
+
+        An empty map becomes a multi-class Hilbert map without occupancy: the points of each class are
+        clustered apart, in any dimension and unit, and the probability of occupancy stays 1/2. A
+        fitted map without classes first gets the class counts of the points. Occupancy and clusters
+        of a fitted map do not change. If anything fails, the map is unchanged.
+
+        Args:
+            points: (N, D) world positions.
+            classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
+            num_clusters: number of clusters of an empty map; None: one per 30 points of a class.
+            seed: random seed of clustering and training.
+            wrong_labels: fraction of the labels that are those of a random other class. The map then
+                answers for the true class.
+            config: training settings.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: wrong shapes, NaN or infinite points, no point has a class, or a class number,
+                probability or wrong_labels is out of range.
+        """
+        check_num_clusters(num_clusters)
+        class_training.check_wrong_labels(wrong_labels)
+        rng = seeded_generator(seed, "fit_classes", self.centers.device)
+        labelled = class_training.check_class_points(points, classes, self.centers)
+        kept = [
+            getattr(self, name).clone()
+            for name in ("posterior_means", "posterior_variances", "posterior_scales")
+        ]
+        if len(self) == 0:
+            found = class_training.clustered(labelled, num_clusters, self.kernel, self.centers, rng)
+        else:
+            state, origin = parameters.read_state(self), self.origin
+            found = class_training.with_classes(state, origin, self.channel_layout, labelled)
+        state, origin, layout = found
+        draft = copy.deepcopy(self)
+        parameters.write_state(draft, class_training.untrained(state), origin, layout)
+        local = draft._to_map_frame(labelled.points)
+        base = draft.class_log_odds(labelled.points)
+        targets = class_training.class_targets(labelled.classes, layout[CLASS], base.dtype)
+        samples = class_training.ClassSamples(*draft._nearest_features(local), base, targets)
+        weights = class_training.initial_weights(state, len(layout[CLASS]))
+        weights = class_training.train_class_weights(
+            samples, weights, config or FitConfig(), rng, wrong_labels
+        )
+        is_fitted = len(self) > 0
+        parameters.write_state(self, replace(state, class_weights=weights), origin, layout)
+        if is_fitted:
+            self.posterior_means, self.posterior_variances, self.posterior_scales = kept
+        return self
+
+    @changes_map
+    @torch.no_grad()
+    def calibrate_classes(
+        self, points: TensorLike, classes: TensorLike, *, wrong_labels: float = 0.0
+    ) -> LardHilbertMap:
+        """Set ``class_scale``, the factor on the class log-odds, to the most likely one for some labels.
+
+        The counts of a cluster answer for a random one of its labels. If a few of them are wrong, they
+        are too cautious about its true class. The factor changes confidences, and no most likely
+        class. Use points that the map has not seen, such as the next scan before it is added.
+
+        Args:
+            points: (N, D) world positions on surfaces [m].
+            classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
+            wrong_labels: fraction of the labels that are those of a random other class.
+
+        Returns:
+            This map.
+
+        Raises:
+            ValueError: the map has no classes, or see `fit_classes`.
+        """
+        class_training.check_wrong_labels(wrong_labels)
+        labelled = class_training.check_class_points(points, classes, self.centers)
+        labelled = class_training.of_known_classes(labelled, self.classes)
+        targets = class_training.class_targets(labelled.classes, self.classes, self.weights.dtype)
+        log_odds = self.class_log_odds(labelled.points) / self.class_scale
+        self.class_scale = class_training.best_scale(log_odds, targets, wrong_labels)
         return self
 
     @changes_map
@@ -286,6 +246,7 @@ class LardHilbertMap(parameters.MapParameters):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
+        channels: Channels | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
         """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
@@ -302,27 +263,34 @@ class LardHilbertMap(parameters.MapParameters):
             num_clusters: maximum number of clusters near the points, over all classes. None: chosen
                 from the number of hits there.
             seed: random seed of clustering and training.
+            channels: see `fit`; channels and classes that are new to the map are added to it.
             config: update settings; `UpdateConfig(as_in_paper=True)` follows the paper.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, or num_clusters is
-                not a positive integer.
+            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, num_clusters is not a
+                positive integer, or a channel is invalid or of another width than in the map.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
-            return self.fit(points, labels, num_clusters, seed=seed)
+            return self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+        channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "update", self.centers.device)
         task = Task(self.kernel, config or UpdateConfig(), rng)
-        changes = updated(parameters.read_state(self), *samples[:2], num_clusters, task)
-        parameters.write_rows(self, *changes)
+        hits = channel_sums.hits_with_channels(*samples[:2], channels)
+        old = self.channel_layout
+        layout = channel_sums.joint_layout(old, channel_sums.layout_of(hits.channels))
+        state = channel_sums.with_layout(parameters.read_state(self), old, layout)
+        changes = updated(state, *samples[:2], num_clusters, task)
+        part = channel_sums.with_hits(changes.part, layout, hits)
+        parameters.write_rows(self, changes.where, part, changes.removed, layout)
         return self
 
     @changes_map
@@ -377,9 +345,10 @@ class LardHilbertMap(parameters.MapParameters):
                 quarter as large, and a later `update` continues with points drawn from the moments of
                 the clusters.
         """
-        left_out = () if evidence else parameters.HISTORY
-        state = {name: value for name, value in self.state_dict().items() if name not in left_out}
-        map_files.save_state(state, path)
+        state = self.state_dict()
+        if not evidence:
+            state = {name: value for name, value in state.items() if name not in HISTORY}
+        map_files.save_state(occupied_sums(state), path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:

@@ -160,6 +160,11 @@ def stored_thickness_counts(model: OccupancyMap) -> Mapping[int, int] | None:
     return model.thickness_counts() if hasattr(model, "thickness_counts") else None
 
 
+def channel_names(model: OccupancyMap) -> tuple[str, ...]:
+    """Names of the channels of a map, such as "color" and "class"; none if it has no channels."""
+    return tuple(getattr(model, "channel_layout", ()))
+
+
 def log_odds_variance(model: OccupancyMap, points: Tensor) -> Tensor:
     """(..., D) world positions [m] -> (...) variance of the log-odds.
 

@@ -66,7 +66,7 @@ def training_points(
 
 def _drop_outliers(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Remove outliers. Warn if there are outliers, or if no point is occupied."""
-    kept = _inliers(points)
+    kept = inliers(points)
     if not bool(kept.all()):
         warnings.warn(
             f"left out {int((~kept).sum())} of {len(points)} points that are far from all others; "
@@ -83,7 +83,7 @@ def _drop_outliers(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     return points, labels
 
 
-def _inliers(points: Tensor) -> Tensor:
+def inliers(points: Tensor) -> Tensor:
     """(N,) mask that is False for outliers, which would degrade the Morton order of all other points.
 
     A point is an outlier if, along any axis, it is farther from the median than `OUTLIER_FACTOR`

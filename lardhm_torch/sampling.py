@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
+from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
 from lardhm_torch.points import UNKNOWN
 from lardhm_torch.scans import Scans
 
@@ -71,12 +72,22 @@ class Samples:
         labels: (N,) 1 occupied, 0 free, 1/2 unknown: no ray was there.
         ray_id: (N,) which ray of the scans a point lies on.
         dropped: number of rays left out, by reason.
+        channels: values of the points by name (`channels`): those of the rays at the hits, missing
+            (NaN, or class -1) at all other points.
+
+    Raises:
+        ValueError: a channel does not have N rows, or one of its values is out of range.
     """
 
     points: Tensor
     labels: Tensor
     ray_id: Tensor
     dropped: dict[str, int]
+    channels: Channels = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        channels = check_channels(self.channels, len(self.points))
+        object.__setattr__(self, "channels", channels)
 
     def __len__(self) -> int:
         """Number of points N."""
@@ -87,8 +98,11 @@ class Samples:
 
         World coordinates far from zero (UTM) lose digits in float32; maps accept float64 points.
         """
-        ray_id = self.ray_id if isinstance(like, torch.dtype) else self.ray_id.to(like)
-        return Samples(self.points.to(like), self.labels.to(like), ray_id, self.dropped)
+        points, labels = self.points.to(like), self.labels.to(like)
+        if isinstance(like, torch.dtype):
+            return replace(self, points=points, labels=labels)
+        channels = {name: values.to(like) for name, values in self.channels.items()}
+        return Samples(points, labels, self.ray_id.to(like), self.dropped, channels)
 
 
 def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str, int]]:
@@ -147,7 +161,7 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
         seed: of the random positions; the same seed gives the same samples.
 
     Returns:
-        Labelled points, the hits first.
+        Labelled points, the hits first, with the channels of their rays.
 
     Raises:
         NoUsableRayError: no ray is usable, or more than half of the hits are outside the range
@@ -194,15 +208,24 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
     known = Samples(points, labels, ray_id, dropped)
+    channels = select_channels(scans.channels, hit_rays)
     if not config.behind_samples:
-        return known
+        return _with_channels(known, channels)
     seen = _rows(first)
     lines = _Lines(
         starts if len(starts) == 1 else _taken(starts, seen),
         _taken(ahead, seen),
         _taken(torch.where(is_hit, free_end, reach), seen),
     )
-    return _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+    samples = _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+    return _with_channels(samples, channels)
+
+
+def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
+    """The samples with the channels of the hits, which come first."""
+    if not of_hits:
+        return samples
+    return replace(samples, channels=pad_channels(of_hits, len(samples)))
 
 
 class _Lines(NamedTuple):

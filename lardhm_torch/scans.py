@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from lardhm_torch.channels import Channels, check_channels, concatenate_channels, select_channels
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +22,12 @@ class Scans:
         scan_id: (R,) scan of each ray, 0 to S - 1; None: all rays belong to scan 0.
         is_return: (R,) True where the ray hit a surface; None: all rays did.
         target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; None: all 1.
+        channels: values of the rays by name, such as color, intensity and class (`channels`); NaN,
+            or -1 for a class, where a ray has none. None: no channels.
 
     Raises:
-        ValueError: a tensor has the wrong shape, or a scan_id has no origin.
+        ValueError: a tensor has the wrong shape, a scan_id has no origin, or a value of a channel is
+            out of range.
     """
 
     origins: Tensor
@@ -30,6 +35,7 @@ class Scans:
     scan_id: Tensor = field(default=None)  # type: ignore[assignment]
     is_return: Tensor = field(default=None)  # type: ignore[assignment]
     target_index: Tensor = field(default=None)  # type: ignore[assignment]
+    channels: Channels = field(default=None)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         ends = torch.as_tensor(self.ends, dtype=torch.float64)
@@ -66,6 +72,7 @@ class Scans:
                 )
         object.__setattr__(self, "origins", origins)
         object.__setattr__(self, "ends", ends)
+        object.__setattr__(self, "channels", check_channels(self.channels, rays, device))
 
     def __len__(self) -> int:
         """Number of rays R."""
@@ -105,6 +112,7 @@ class Scans:
             self.scan_id[rays],
             self.is_return[rays],
             self.target_index[rays],
+            select_channels(self.channels, rays),
         )
 
     def drop_constant_column(self) -> Scans:
@@ -120,14 +128,16 @@ class Scans:
             raise ValueError(
                 f"the last coordinate must be constant to be dropped; it spans {spread:.3g} m"
             )
-        return Scans(origins[:, :-1], ends[:, :-1], self.scan_id, self.is_return, self.target_index)
+        return replace(self, origins=origins[:, :-1], ends=ends[:, :-1])
 
 
 def concatenate_scans(parts: list[Scans]) -> Scans:
     """Concatenate the rays of several Scans. Scan numbers are renumbered consecutively.
 
+    Rays of a part without a channel have no value in it.
+
     Raises:
-        ValueError: ``parts`` is empty, or the dimensions differ.
+        ValueError: ``parts`` is empty, or the dimensions or the shapes of a channel differ.
     """
     if not parts:
         raise ValueError("parts must hold at least one Scans; got none")
@@ -145,6 +155,7 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
         torch.cat([part.scan_id + n for part, n in zip(parts, before, strict=False)]),
         torch.cat([part.is_return for part in parts]),
         torch.cat([part.target_index for part in parts]),
+        concatenate_channels([(part.channels, len(part)) for part in parts]),
     )
 
 
@@ -153,7 +164,7 @@ def every_scan(scans: Scans, step: int) -> Scans:
     kept = torch.arange(0, scans.num_scans, step, device=scans.ends.device)
     rays = scans.select(scans.scan_id % step == 0)
     scan_id = torch.div(rays.scan_id, step, rounding_mode="floor")
-    return Scans(scans.origins[kept], rays.ends, scan_id, rays.is_return, rays.target_index)
+    return replace(rays, origins=scans.origins[kept], scan_id=scan_id)
 
 
 def thin_rays(scans: Scans, voxel: float | None) -> Scans:

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.materials import measured_materials, surface_classes, surface_colors
+from lardhm_torch.sampling import seeded_generator
 from lardhm_torch.scans import Scans
 
 if TYPE_CHECKING:
@@ -96,7 +99,14 @@ CYLINDERS = (
 SPHERES = ((0.6, 3.7, 1.55, 0.2), (6.0, 4.7, 1.0, 0.2))  # shade of the lamp, globe
 
 
-def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) -> Scans:
+def simulate_room(
+    num_rays: int = 50_000,
+    noise: float = 0.02,
+    seed: int = 0,
+    *,
+    exposure_noise: float = 0.0,
+    wrong_labels: float = 0.0,
+) -> Scans:
     """Simulate three laser scanners in a furnished room of 8 m x 5 m x 2.6 m.
 
     Each scanner emits one third of the rays, evenly distributed over all directions up to 75 degrees
@@ -108,12 +118,17 @@ def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) ->
         noise: standard deviation of the Gaussian range noise [m]. The paper writes
             sigma² = N(0, 0.1), which leaves the unit open; 0.02 m is typical of laser scanners.
         seed: random seed of the rotations of the spirals and of the noise.
+        exposure_noise: standard deviation of the logarithm of the exposure of each scanner; half of it
+            applies to the brightness of each ray.
+        wrong_labels: fraction of the rays with the label of a random other class.
 
     Returns:
-        Scans with three origins, in the world frame.
+        Scans with three origins, in the world frame, with the channels "color" and "class" (an index
+        into `materials.CLASS_NAMES`).
 
     Raises:
-        ValueError: num_rays is below 3, or noise is negative.
+        ValueError: num_rays is below 3, noise or exposure_noise is negative, or wrong_labels is not
+            from 0 to 1.
 
     Source: Guizilini & Ramos 2016, Section IV-A (three simulated lasers, about 40 m², 50k points).
     """
@@ -121,17 +136,33 @@ def simulate_room(num_rays: int = 50_000, noise: float = 0.02, seed: int = 0) ->
         raise ValueError(f"num_rays must be at least 3, one per scanner; got {num_rays}")
     if not noise >= 0:
         raise ValueError(f"noise must be >= 0 m; got {noise}")
+    if not exposure_noise >= 0 or not 0 <= wrong_labels <= 1:
+        raise ValueError(
+            "exposure_noise must be >= 0 and wrong_labels from 0 to 1; "
+            f"got {exposure_noise} and {wrong_labels}"
+        )
     rng = torch.Generator().manual_seed(seed)
     origins = torch.tensor(SCANNERS, dtype=torch.float64)
     counts = [(num_rays + i) // len(SCANNERS) for i in range(len(SCANNERS))]
     scan_id = torch.repeat_interleave(torch.arange(len(SCANNERS)), torch.tensor(counts))
     directions = torch.cat([_spiral(count, rng) for count in counts])
-    ranges = true_ranges(origins[scan_id], directions)
+    ranges, shapes = first_shapes(origins[scan_id], directions)
     is_return = ranges.isfinite()
+    surface = origins[scan_id] + ranges.where(is_return, 0)[:, None] * directions
+    classes = surface_classes(shapes, surface, ROOM[2])
+    channels = measured_materials(
+        classes,
+        surface_colors(classes, surface),
+        scan_id,
+        is_return,
+        exposure_noise=exposure_noise,
+        wrong_labels=wrong_labels,
+        rng=seeded_generator(seed, "materials"),
+    )
     error = noise * torch.randn(num_rays, generator=rng, dtype=torch.float64)
     ranges = torch.where(is_return, (ranges + error).clamp(min=0.0), MAX_RANGE)
     ends = origins[scan_id] + ranges[:, None] * directions
-    return Scans(origins, ends, scan_id, is_return)
+    return Scans(origins, ends, scan_id, is_return, channels=channels)
 
 
 def true_ranges(origins: Tensor, directions: Tensor) -> Tensor:
@@ -144,21 +175,44 @@ def true_ranges(origins: Tensor, directions: Tensor) -> Tensor:
     Returns:
         (R,) ranges [m]; infinite where the ray leaves through the doorway or the window.
     """
+    return first_shapes(origins, directions)[0]
+
+
+def true_classes(points: Tensor, scan_origins: Tensor) -> Tensor:
+    """(R, 3) hits, with noise, and (R, 3) origins of their rays [m] -> (R,) true classes."""
+    directions = torch.nn.functional.normalize(points - scan_origins, dim=1)
+    ranges, shapes = first_shapes(scan_origins, directions)
+    surface = scan_origins + ranges[:, None] * directions
+    return surface_classes(shapes, surface, ROOM[2])
+
+
+def first_shapes(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """The (R,) ranges of `true_ranges`, and the (R,) number of the shape that each ray hits.
+
+    Boxes, cylinders and spheres are numbered in this order; -1 is the shell.
+    """
     ranges = _shell_ranges(origins, directions)
+    shapes = torch.full(ranges.shape, -1, device=ranges.device)
+    for number, (near, is_hit) in enumerate(_shape_ranges(origins, directions)):
+        shapes[is_hit & (near < ranges)] = number
+        ranges = torch.where(is_hit, torch.minimum(ranges, near), ranges)
+    return ranges, shapes
+
+
+def _shape_ranges(origins: Tensor, directions: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """(R,) distance at which rays enter each shape, and (R,) whether they do."""
     for box in BOXES:
         near, far = _slab(origins, directions, origins.new_tensor(box))
-        ranges = torch.where((near <= far) & (near > 0), torch.minimum(ranges, near), ranges)
+        yield near, (near <= far) & (near > 0)
     for x, y, radius, low, high in CYLINDERS:
         round_near, round_far = _ball(origins, directions, (x, y), radius)
         height = origins.new_tensor([low, high])
         flat_near, flat_far = _slab(origins[:, 2:], directions[:, 2:], height)
         near = torch.maximum(round_near, flat_near)
-        hit = (near <= torch.minimum(round_far, flat_far)) & (near > 0)
-        ranges = torch.where(hit, torch.minimum(ranges, near), ranges)
+        yield near, (near <= torch.minimum(round_far, flat_far)) & (near > 0)
     for *center, radius in SPHERES:
         near, far = _ball(origins, directions, tuple(center), radius)
-        ranges = torch.where((near <= far) & (near > 0), torch.minimum(ranges, near), ranges)
-    return ranges
+        yield near, (near <= far) & (near > 0)
 
 
 def room_mesh() -> trimesh.Trimesh:

@@ -177,7 +177,14 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         warnings.warn(f"scan {number} was skipped: no usable ray; {error}", stacklevel=3)
         return
     num_clusters = _num_clusters(samples, config)
-    model.update(samples.points, samples.labels, num_clusters, seed=seed, config=config.update)
+    model.update(
+        samples.points,
+        samples.labels,
+        num_clusters,
+        seed=seed,
+        channels=samples.channels,
+        config=config.update,
+    )
     if config.radius is not None:
         model.crop(scan.origins[0], config.radius)
 

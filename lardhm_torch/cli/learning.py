@@ -29,7 +29,12 @@ def simulate(arguments: argparse.Namespace) -> None:
     from lardhm_torch import save_scans, simulate_room
 
     check_output(arguments.output, (".npz",))
-    scans = simulate_room(num_rays=arguments.rays, seed=arguments.seed)
+    scans = simulate_room(
+        num_rays=arguments.rays,
+        seed=arguments.seed,
+        exposure_noise=arguments.exposure_noise,
+        wrong_labels=arguments.wrong_labels,
+    )
     save_scans(scans, arguments.output)
     print(f"{len(scans)} rays of {scans.num_scans} scans -> {arguments.output}")
 
@@ -76,7 +81,12 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         raise ValueError(f"scans must hold at least one hit within range; got {samples.dropped}")
     model = _new_map(scans.dim, arguments)
     model.fit(
-        samples.points, samples.labels, arguments.clusters, seed=arguments.seed, progress=True
+        samples.points,
+        samples.labels,
+        arguments.clusters,
+        seed=arguments.seed,
+        channels=samples.channels,
+        progress=True,
     )
     if arguments.tune or arguments.tune_state:
         _tune(model, scans, samples, state, arguments)

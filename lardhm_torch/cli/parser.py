@@ -46,6 +46,20 @@ def _scan_verbs(verb: Any) -> None:
     sub.add_argument(
         "--rays", type=int, default=50_000, metavar="N", help="number of rays (default: 50000)"
     )
+    sub.add_argument(
+        "--exposure-noise",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="standard deviation of the logarithm of each scanner's exposure (default: 0)",
+    )
+    sub.add_argument(
+        "--wrong-labels",
+        type=float,
+        default=0.0,
+        metavar="F",
+        help="fraction of rays with the label of another class (default: 0)",
+    )
     _seed(sub)
 
     sub = verb(learning.split)
@@ -131,6 +145,12 @@ def _file_verbs(verb: Any) -> None:
         "points", metavar="POINTS", help="(N, D) points as .npy or .npz, or any scan file"
     )
     _output(sub, "float32 probabilities to write, in the order of the points: .npy")
+    sub.add_argument(
+        "--channel",
+        metavar="NAME",
+        help="write the values of a channel of the map instead, such as color, or class for the "
+        "probability of each class",
+    )
 
     sub = verb(queries.mesh)
     sub.add_argument("map", metavar="MAP", help=MAP)
@@ -325,7 +345,7 @@ def _surface(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--color",
-        choices=("height", "cluster", "probability"),
         default="height",
-        help="what vertex colors show (default: height)",
+        help="what vertex colors show: height, cluster, probability, variance, or a channel of the "
+        "map, such as color, intensity or class (default: height)",
     )

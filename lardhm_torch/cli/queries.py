@@ -25,6 +25,7 @@ def query(arguments: argparse.Namespace) -> None:
 
     from lardhm_torch.io.atomic_files import replaced_file
     from lardhm_torch.io.scan_files import load_points
+    from lardhm_torch.queries.channels import channel
     from lardhm_torch.tiles.tiled_map import open_map
 
     check_output(arguments.output, (".npy",), [arguments.map, arguments.points])
@@ -33,10 +34,13 @@ def query(arguments: argparse.Namespace) -> None:
     if points.shape[1] == model.dim + 1 and bool((points[:, -1] == points[:1, -1]).all()):
         points = points[:, :-1]  # flat scans, as `fit --dim 2` takes them
     with torch.no_grad():
-        probability = model(points).float().numpy()
+        if arguments.channel is None:
+            probability = model(points).float().numpy()
+        else:
+            probability = channel(model, points, arguments.channel).float().numpy()
     with replaced_file(arguments.output) as partial, open(partial, "wb") as file:
         np.save(file, probability)
-    print(f"{len(probability)} probabilities -> {arguments.output}")
+    print(f"{len(probability)} {arguments.channel or 'probabilities'} -> {arguments.output}")
 
 
 def mesh(arguments: argparse.Namespace) -> None:
@@ -144,6 +148,9 @@ def _check_address(host: str, port: int) -> None:
 
 def render(arguments: argparse.Namespace) -> None:
     """Draw a map to a picture; no display is needed."""
+    import numpy as np
+
+    from lardhm_torch.surfaces.channel_colors import class_colors
     from lardhm_torch.tiles.tiled_map import open_map
     from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
@@ -156,7 +163,12 @@ def render(arguments: argparse.Namespace) -> None:
         return
     surface = _surface(model, arguments)
     angles = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
-    render_mesh(surface, arguments.output, cut_above=arguments.cut_above, **angles)
+    legend = None
+    if arguments.color == "class":
+        labels = np.unique(np.asarray(surface.vertex_attributes["label"]))
+        colors = class_colors(labels[labels >= 0].tolist())
+        legend = {f"class {number}": rgb for number, rgb in colors.items()}
+    render_mesh(surface, arguments.output, cut_above=arguments.cut_above, legend=legend, **angles)
     print(f"{len(surface.faces)} faces -> {arguments.output}")
 
 
@@ -247,6 +259,10 @@ def _info_of_file(path: str) -> dict[str, Any]:
         "training points": int(model.counts.sum()),
         "origin [m]": model.origin.tolist(),
     }
+    if model.channel_layout:
+        rows["channels"] = list(model.channel_layout)
+    if model.classes:
+        rows["classes"] = model.classes
     if len(model):
         lower, upper = map_bounds(model)
         rows["bounds [m]"] = [[round(float(v), 3) for v in corner] for corner in (lower, upper)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lardhm_torch.io.bag_files import BagParts, Message, bag_parts, read_messages
 from lardhm_torch.io.bag_poses import CloudPoses, PoseSources, PoseTopic, cloud_poses
+from lardhm_torch.io.channel_columns import joined_columns
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import Readout
 from lardhm_torch.io.ros_clouds import CLOUDS, Cloud, read_cloud
@@ -188,6 +189,7 @@ def _readout(clouds: list[Cloud], poses: CloudPoses, notes: list[Note]) -> Reado
         scan_id=np.repeat(np.arange(len(placed)), [len(points) for points in ends]),
         is_return=_returns([clouds[i] for i in placed]),
         notes=(*notes, *poses.notes),
+        channels=joined_columns([(clouds[i].channels, len(clouds[i].points)) for i in placed]),
     )
 
 

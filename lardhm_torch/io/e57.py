@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.channel_columns import joined_columns
+from lardhm_torch.io.e57_channels import CHANNEL_FIELDS, channels_of, white_of
 from lardhm_torch.io.no_returns import NO_RETURNS
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.origins import with_identities
@@ -29,7 +31,8 @@ def read_e57(path: Path) -> Readout:
 
     Points that the scanner marked invalid are left out, as are those at exactly zero. Where it
     marked the range alone as invalid, the beam had no return: it is free up to the longest range
-    of its scan. A field returnIndex gives target_index. Identity poses are what writers put when
+    of its scan. A field returnIndex gives target_index. Colors and intensity are channels, missing
+    where they are marked as invalid. Identity poses are what writers put when
     they know none (`with_identities`); a scan without a pose among scans with one has no known
     origin.
 
@@ -71,6 +74,7 @@ def read_e57(path: Path) -> Readout:
             scan_id=np.repeat(np.arange(len(scans)), [len(scan.ends) for scan in scans]),
             origin_cure="Export the scans with their poses",
             notes=tuple(notes),
+            channels=joined_columns([(scan.channels, len(scan.ends)) for scan in scans]),
         ),
         poses,
     )
@@ -123,7 +127,8 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
     if count * _LEAST_BYTES > size:
         raise ValueError(f"{count} points are promised; {size} bytes are too few")
     state = names[0].removesuffix("X").removesuffix("Range") + "InvalidState"
-    wanted = [*names, *(n for n in (state, "returnIndex") if n in header.point_fields)]
+    others = (state, "returnIndex", *CHANNEL_FIELDS)
+    wanted = [*names, *(n for n in others if n in header.point_fields)]
     capacity = min(count, _RECORDS_AT_A_TIME)
     piece = {name: np.empty(capacity) for name in wanted}
     if not count:
@@ -140,6 +145,9 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
         raise ValueError(f"{count} points are promised; got {count - left}")
     columns = {name: np.concatenate([part[name] for part in pieces]) for name in wanted}
     columns["state"] = columns.pop(state, np.zeros(count))
+    white = white_of(header)
+    if white is not None:
+        columns["white"] = np.full(count, white)
     return columns
 
 
@@ -158,6 +166,7 @@ def _scan_of(columns: dict[str, NDArray[np.float64]]) -> Readout:
         points,
         is_return=is_hit,
         target_index=whole_numbers(target, "returnIndex", 0, 255) + 1,
+        channels=channels_of(columns),
     )
     kept = is_hit | is_beam
     readout = readout if kept.all() else readout.select(kept)

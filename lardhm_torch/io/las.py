@@ -11,6 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.las_channels import BYTE, channels_of, joined_channels, white_of
 from lardhm_torch.io.moving_sensor import TRACK_FILES
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.poses import find_beside
@@ -28,6 +29,9 @@ _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 def read_las(path: Path) -> Readout:
     """Coordinates X scale + offset, float64, and the return number of each point.
 
+    Channels: intensity, color of 16 bits, or of 8 where no value is above 255, and classification, of
+    which 0 (never classified) is missing. Those that are 0 at all points are left out.
+
     Points flagged as withheld are left out. A return number of 0, which the format forbids, is what
     writers leave when they know none: such points count as first returns.
 
@@ -35,9 +39,11 @@ def read_las(path: Path) -> Readout:
         ImportError: laspy or its LAZ part is not installed.
         ValueError: the header is not one of LAS, or the file is shorter than it says.
     """
-    pieces = list(las_pieces(path))
+    found = list(_las_pieces(path, None))
+    pieces = [piece for piece, _ in found]
     if len(pieces) == 1:
         return pieces[0]
+    parts = [(dict(piece.channels), len(piece.ends), white) for piece, white in found]
     returns = [piece.target_index for piece in pieces if piece.target_index is not None]
     times = [piece.times for piece in pieces if piece.times is not None]
     withheld = sum(note.count or 0 for piece in pieces for note in piece.notes)
@@ -46,18 +52,28 @@ def read_las(path: Path) -> Readout:
         ends=np.concatenate([piece.ends for piece in pieces]),
         target_index=np.concatenate(returns),
         times=np.concatenate(times) if times else None,
+        channels=joined_channels(parts),
         notes=(Note(_WITHHELD, withheld),) if withheld else (),
     )
 
 
 def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
-    """The same a piece of at most ``max_points`` (default: of 32 MB) at a time; errors as there."""
+    """The same a piece of at most ``max_points`` (default: of 32 MB) at a time; errors as there.
+
+    Colors count as 8-bit numbers until the first piece with a value above 255.
+    """
+    for piece, _ in _las_pieces(path, max_points):
+        yield piece
+
+
+def _las_pieces(path: Path, max_points: int | None) -> Iterator[tuple[Readout, float]]:
+    """Pieces, and what was taken for the number of white in each."""
     with open(path, "rb") as file:
         header = _Header(file, path.stat().st_size)
         if header.is_compressed:
             _check_compressed(file, header)
     with_times = find_beside(path, TRACK_FILES) is not None
-    got = 0
+    got, white = 0, BYTE
     laspy = _import_laspy(path)
     step = max_points or max(1, _BYTES_AT_A_TIME // header.point_bytes)
     # One thread: the parallel reader allocates what the chunk table claims.
@@ -65,12 +81,13 @@ def las_pieces(path: Path, max_points: int | None = None) -> Iterator[Readout]:
         reader.header.point_count = header.count
         for points in reader.chunk_iterator(step):
             got += len(points)
-            yield _readout_of(points, with_times)
+            white = white_of(points, white)
+            yield _readout_of(points, with_times, white), white
     if got == 0 or got != header.count:
         raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
 
 
-def _readout_of(points: Any, with_times: bool) -> Readout:
+def _readout_of(points: Any, with_times: bool, white: float) -> Readout:
     """The points that are not withheld; what lies within half a step of zero is at zero."""
     target = np.asarray(points.return_number).astype(np.int64)
     has_times = with_times and "gps_time" in points.point_format.dimension_names
@@ -79,6 +96,7 @@ def _readout_of(points: Any, with_times: bool) -> Readout:
         target_index=target if target.all() else np.maximum(target, 1),
         origin_cure="Put its trajectory.txt (GPS time, x, y, z a line) or a pose file beside it",
         times=np.array(points.gps_time, dtype=np.float64) if has_times else None,
+        channels=channels_of(points, white),
     )
     withheld = np.asarray(points.withheld)
     if not withheld.any():

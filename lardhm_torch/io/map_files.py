@@ -28,6 +28,7 @@ from torch import Tensor
 from lardhm_torch.io.atomic_files import replaced_file
 
 FORMAT_VERSION = 2
+CHANNEL_SETTINGS = ("channels", "class_scale")  # in the extra state of a map with channels
 STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
 SAFETENSORS = ".safetensors"
 MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it
@@ -93,7 +94,7 @@ def map_settings(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_settings(extra: Any) -> dict[str, Any]:
-    """The settings in the extra state of a map, without the format version.
+    """The settings in the extra state of a map, without the format version and the channels.
 
     Raises:
         ValueError: there are none, or the format version is not supported.
@@ -102,7 +103,7 @@ def check_settings(extra: Any) -> dict[str, Any]:
         raise ValueError(
             "_extra_state must hold the map's format version and settings; it does not"
         )
-    settings = dict(extra)
+    settings = {name: v for name, v in extra.items() if name not in CHANNEL_SETTINGS}
     version = settings.pop("format_version")
     if version != FORMAT_VERSION:
         cure = (

@@ -22,6 +22,7 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
 
     Far from zero (UTM) float32 is too coarse for a mesh: .ply then holds float64, .glb a mesh near
     zero and a shift; .obj and .off hold text anyway; .stl cannot, and a warning says so.
+    .ply, .glb and .obj hold vertex colors; .ply also the vertex attribute "label".
 
     Args:
         mesh: the mesh [m].
@@ -38,6 +39,9 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
         raise ValueError(f"path must end in one of {known} for a mesh; got {path.name!r}")
     error = float(np.abs(mesh.vertices - mesh.vertices.astype(np.float32)).max(initial=0.0))
     is_coarse = error > FLOAT32_ERROR
+    if suffix == ".glb":  # has no integer attributes
+        mesh = mesh.copy()
+        mesh.vertex_attributes.clear()
     with replaced_file(path) as partial:
         if is_coarse and suffix == ".ply":
             partial.write_bytes(_float64_ply(mesh))
@@ -53,20 +57,25 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
 
 
 def _float64_ply(mesh: trimesh.Trimesh) -> bytes:
-    """A binary PLY file with float64 coordinates, and colors where the mesh has them."""
+    """A binary PLY file with float64 coordinates, and colors and labels where the mesh has them."""
     vertex = [(name, "<f8") for name in "xyz"]
     visual: Any = mesh.visual
     has_colors = visual.kind == "vertex"
     if has_colors:
         vertex += [(name, "u1") for name in ("red", "green", "blue", "alpha")]
+    labels = mesh.vertex_attributes.get("label")
+    vertex += [] if labels is None else [("label", "<i4")]
     vertices = np.zeros(len(mesh.vertices), vertex)
+    if labels is not None:
+        vertices["label"] = labels
     columns = np.hstack([mesh.vertices, visual.vertex_colors]) if has_colors else mesh.vertices
-    for (name, _), values in zip(vertex, columns.T, strict=True):
+    for (name, _), values in zip(vertex, columns.T, strict=False):
         vertices[name] = values
     faces = np.zeros(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property {'double' if kind == '<f8' else 'uchar'} {name}" for name, kind in vertex]
+    types = {"<f8": "double", "u1": "uchar", "<i4": "int"}
+    lines += [f"property {types[kind]} {name}" for name, kind in vertex]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     return "\n".join([*lines, ""]).encode() + vertices.tobytes() + faces.tobytes()
 

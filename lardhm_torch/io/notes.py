@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lardhm_torch.channels import count_missing
 from lardhm_torch.scans import Scans
 
 
@@ -78,6 +79,7 @@ class ScanReport:
         self.files: list[Path] = []
         self.num_scans = 0
         self.num_rays = 0
+        self.channels: dict[str, int] = {}  # number of rays with a value, by channel
         self._corners: list[np.ndarray] = []  # lowest and highest sensor coordinates so far
         self._notes: dict[tuple[str, str], list[int | None]] = {}  # number of files, total count
 
@@ -91,6 +93,8 @@ class ScanReport:
             if self._corners:  # a file without a pose in time has no scan
                 self._corners = [pick(self._corners, axis=0) for pick in (np.min, np.max)]
         self.num_rays += len(scans)
+        for name, lost in count_missing(scans.channels).items():
+            self.channels[name] = self.channels.get(name, 0) + len(scans) - lost
         for note in notes:
             tally = self._notes.setdefault((note.text, note.cure), [0, None])
             tally[0] = (tally[0] or 0) + is_new
@@ -108,6 +112,7 @@ class ScanReport:
             "files": [str(file) for file in self.files],
             "scans": self.num_scans,
             "rays": self.num_rays,
+            "channels": dict(self.channels),
             "sensor [m]": [corner.tolist() for corner in self._corners],
             "notes": [
                 {"text": note.text, "count": note.count, "guess": note.is_guess, "cure": note.cure}
@@ -122,6 +127,8 @@ class ScanReport:
         if corners:
             one = corners[0] == corners[1]
             parts.append("sensor at " + (corners[0] if one else " to ".join(corners)) + " m")
+        if self.channels:
+            parts.append(", ".join(f"{name} of {n} rays" for name, n in self.channels.items()))
         for note, (files, _) in zip(self.notes, self._notes.values(), strict=True):
             in_some = "" if files in (0, len(self.files)) else f" (in {files} of them)"
             parts.append(f"{note}{in_some}")

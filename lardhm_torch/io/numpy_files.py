@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from io import BytesIO
 from pathlib import Path
@@ -15,24 +15,28 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from lardhm_torch.channels import CLASS, COLOR, INTENSITY
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.readout import Readout, whole_numbers
 
 _DEFLATE_RATIO = 1032  # no deflate stream expands further
 _RAY_ARRAYS = ("points", "scan_id", "is_return", "target_index")  # one entry a ray
+_CHANNELS = (CLASS, COLOR, INTENSITY)  # arrays of their own names; others begin with the prefix
+_PREFIX = "channel_"
 
 
 def read_npz(path: Path) -> Readout:
     """Scans from ``points``, ``origins``, ``scan_id`` and optional ``is_return``, ``target_index``.
 
-    ``scan_id`` may be left out where there is one origin.
+    ``scan_id`` may be left out where there is one origin. Arrays ``color``, ``intensity``, ``class``
+    and ``channel_NAME`` of one row per point are channels (see `lardhm_torch.channels`).
 
     Raises:
         ValueError: the archive is broken, or an array is missing or has the wrong shape or type.
     """
     with zipfile.ZipFile(path) as archive:
         columns = {"points": _points_of(archive)}
-        for name in _RAY_ARRAYS[1:]:
+        for name in (*_RAY_ARRAYS[1:], *_channel_arrays(archive)):
             values = _optional(archive, name)
             if values is not None:
                 columns[name] = values
@@ -45,6 +49,7 @@ def npz_pieces(path: Path, max_points: int) -> Iterator[Readout]:
     with zipfile.ZipFile(path) as archive, ExitStack() as stack:
         present = set(archive.namelist())
         names = [name for name in _RAY_ARRAYS if f"{name}.npy" in present]
+        names += _channel_arrays(archive)
         columns = {name: stack.enter_context(_Column(archive, name)) for name in names}
         if "points" not in columns or any(not column.in_rows for column in columns.values()):
             yield read_npz(path)  # reports missing arrays, or transposes
@@ -68,7 +73,30 @@ def _npz_piece(columns: dict[str, NDArray], origins: NDArray | None) -> Readout:
         None if is_return is None else _integers(is_return, "is_return", 0, 1).astype(bool),
         None if target_index is None else _integers(target_index, "target_index", 1),
         origin_cure="Add an array origins (S, D)",
+        channels=_channels_of(columns),
     )
+
+
+def _channel_arrays(archive: zipfile.ZipFile) -> list[str]:
+    """Names of the arrays that are channels."""
+    names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+    return [name for name in names if name in _CHANNELS or name.startswith(_PREFIX)]
+
+
+def _channels_of(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+    """The channels among arrays, with bytes of colors divided by 255."""
+    count, found = len(columns["points"]), dict[str, NDArray]()
+    for name, values in columns.items():
+        if name not in _CHANNELS and not name.startswith(_PREFIX):
+            continue
+        if values.ndim not in (1, 2) or len(values) != count:
+            raise ValueError(f"{name} must have {count} rows, one per point; got {values.shape}")
+        if name == CLASS and values.dtype.kind in "iub":
+            found[name] = np.array(values, dtype=np.int64)
+            continue
+        scale = np.float32(255 if name == COLOR and values.dtype == np.uint8 else 1)
+        found[name.removeprefix(_PREFIX)] = np.array(values, dtype=np.float32) / scale
+    return found
 
 
 class _Column:
@@ -120,14 +148,17 @@ def read_npy(path: Path) -> Readout:
     return Readout(_coordinates(array, "the array"))
 
 
-def write_npz(path: Path, arrays: dict[str, NDArray]) -> None:
-    """Write arrays to path in one step.
+def write_npz(
+    path: Path, arrays: Mapping[str, NDArray], channels: Mapping[str, NDArray] | None = None
+) -> None:
+    """Write arrays, and channels by the names that the readers look for, to path in one step.
 
     Raises:
         FileNotFoundError: the folder does not exist.
     """
+    named = {n if n in _CHANNELS else _PREFIX + n: v for n, v in (channels or {}).items()}
     with replaced_file(path) as partial, open(partial, "wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, allow_pickle=False, **arrays, **named)
 
 
 def _points_of(archive: zipfile.ZipFile) -> NDArray[np.float64]:

@@ -155,8 +155,10 @@ def scans_from(readout: Readout, file: Path) -> Scans:
         "is_return": readout.is_return,
         "target_index": readout.target_index,
     }
+    known = {name: torch.from_numpy(v) for name, v in columns.items() if v is not None}
+    channels = {name: torch.from_numpy(v) for name, v in readout.channels.items()}
     try:
-        scans = Scans(**{k: torch.from_numpy(v) for k, v in columns.items() if v is not None})
+        scans = Scans(**known, channels=channels)
     except ValueError as error:
         raise ValueError(f"{file} does not hold scans: {error}") from error
     if not np.isfinite(scans.origins.numpy()).all():

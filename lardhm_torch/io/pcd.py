@@ -18,12 +18,14 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.channel_columns import CHANNEL_COLUMNS
 from lardhm_torch.io.notes import Note
-from lardhm_torch.io.readout import COLUMN_NAMES, Readout, readout_from_columns
+from lardhm_torch.io.readout import COLUMN_NAMES, RAY_COLUMNS, Readout, readout_from_columns
 from lardhm_torch.io.records import (
     Columns,
     Field,
     bytes_left,
+    column_type,
     header_count,
     header_lines,
     read_ascii,
@@ -33,6 +35,7 @@ from lardhm_torch.io.records import (
 from lardhm_torch.io.trajectories import poses_from_quaternions
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
+_SIZES = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
 _ENTRIES = frozenset(
     {"VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT"}
     | {"WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
@@ -132,11 +135,14 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
     fields = []
     for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True):
         number = header_count(count, f"COUNT of field {name}")
-        if name.lower() not in COLUMN_NAMES:  # padding, say; PCL writes it with any type and size
+        is_number = kind in _KINDS and size in _SIZES[kind]
+        is_channel = name.lower() in CHANNEL_COLUMNS and is_number and number == 1
+        if name.lower() not in RAY_COLUMNS and not is_channel:  # padding: any type and size
             width = header_count(size, f"SIZE of field {name}")
-            fields.append(Field(name.lower(), f"V{width}", number))
+            known = "" if name.lower() in CHANNEL_COLUMNS else name.lower()  # is not read
+            fields.append(Field(known, f"V{width}", number))
             continue
-        if kind not in _KINDS or size not in (("4", "8") if kind == "F" else ("1", "2", "4", "8")):
+        if not is_number:
             raise ValueError(f"field {name} has TYPE {kind} and SIZE {size}, which no PCD may have")
         if number != 1:
             raise ValueError(f"COUNT of field {name} must be 1; got {number}")
@@ -211,7 +217,7 @@ def _read_compressed(file: BinaryIO, header: _Header) -> Columns:
     for field in header.fields:
         if field.name in COLUMN_NAMES:
             values = np.frombuffer(content, field.format, header.count, offset)
-            columns[field.name] = values.astype(np.float64)
+            columns[field.name] = values.astype(column_type(field.name, values.dtype))
         offset += header.count * field.num_bytes
     return columns
 

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from lardhm_torch.io.readout import COLUMN_NAMES
-from lardhm_torch.io.records import Columns, Field, bytes_left
+from lardhm_torch.io.records import Columns, Field, bytes_left, column_type
 
 _LONGEST = 1 << 16  # entries of one list
 
@@ -81,7 +81,8 @@ def read_binary_lists(file: BinaryIO, fields: Sequence[Field | ListField], count
                     wanted[field.name][number] = value
             at += length
     file.seek(start + at)
-    return {name: values.astype(np.float64) for name, values in wanted.items()}
+    types = {f.name: np.dtype(f.format) for f in fields if f.name in wanted}
+    return {name: v.astype(column_type(name, types[name])) for name, v in wanted.items()}
 
 
 def _wanted(fields: Sequence[Field | ListField]) -> list[str]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.channel_columns import CHANNEL_COLUMNS, channels_from_columns
 from lardhm_torch.io.notes import Note
 
-COLUMN_NAMES = frozenset(
+RAY_COLUMNS = frozenset(
     {"x", "y", "z", "ox", "oy", "oz", "scan_id", "is_return", "target_index", "return_number"}
 )
+COLUMN_NAMES = RAY_COLUMNS | CHANNEL_COLUMNS  # those that are read
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class Readout:
         notes: what was assumed or left out.
         times: (R,) float64 when each ray was measured [s], in the clock of the file.
         grid: rows and columns of an organized cloud, whose rays come row by row.
+        channels: (R, ...) values of the rays by name, see `lardhm_torch.channels`.
     """
 
     ends: NDArray[np.float64]
@@ -44,6 +47,7 @@ class Readout:
     notes: tuple[Note, ...] = ()
     times: NDArray[np.float64] | None = None
     grid: tuple[int, int] | None = None
+    channels: Mapping[str, NDArray] = field(default_factory=dict)
 
     def noting(self, *notes: Note) -> Readout:
         """The same with more notes."""
@@ -54,7 +58,8 @@ class Readout:
         columns = ("ends", "scan_id", "is_return", "target_index", "times")
         values = {name: getattr(self, name) for name in columns}
         kept = {name: value[rays] for name, value in values.items() if value is not None}
-        return replace(self, **kept, grid=None)
+        channels = {name: values[rays] for name, values in self.channels.items()}
+        return replace(self, **kept, grid=None, channels=channels)
 
     @property
     def dim(self) -> int:
@@ -103,6 +108,7 @@ def without_zeros(readout: Readout) -> Readout:
 def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
     """Named columns of equal length as rays: x y [z], ox oy [oz], scan_id, is_return, target_index.
 
+    Columns of `channel_columns` have the types of the file and become channels.
     Rows with the same scan_id and the same origin are one scan. Scans are numbered in ascending
     scan_id, or, without one, in order of first appearance.
 
@@ -132,6 +138,7 @@ def readout_from_columns(columns: Mapping[str, NDArray]) -> Readout:
         None if is_return is None else whole_numbers(is_return, "is_return", 0, 1).astype(bool),
         None if target is None else whole_numbers(target, "target_index", 1, 2**31),
         notes=notes,
+        channels=channels_from_columns(columns),
     )
 
 

@@ -12,9 +12,10 @@ from typing import BinaryIO, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.io.channel_columns import CHANNEL_COLUMNS
 from lardhm_torch.io.readout import COLUMN_NAMES
 
-Columns = dict[str, NDArray[np.float64]]
+Columns = dict[str, NDArray]  # float64; channels have the type of the file
 _MAX_HEADER_LINES = 10_000
 _MAX_LINE_BYTES = 65_536
 
@@ -88,7 +89,7 @@ def read_binary(
         rows = min(step, count - start)
         records = np.fromfile(file, np.dtype((np.void, size)), rows)
         yield {
-            name: np.ndarray(rows, dtype, records, offset, (size,)).astype(np.float64)
+            name: np.ndarray(rows, dtype, records, offset, (size,)).astype(column_type(name, dtype))
             for name, (dtype, offset) in wanted.items()
         }
 
@@ -116,7 +117,15 @@ def read_ascii(
     table = read_table(path, skip_lines, list(wanted.values()), max_rows=count, comments=None)
     if len(table) != count:
         raise ValueError(f"{count} points are promised; got {len(table)} lines")
-    return {name: table[:, i] for i, name in enumerate(wanted)}
+    types = {field.name: np.dtype(field.format) for field in fields if field.name in wanted}
+    return {
+        name: table[:, i].astype(column_type(name, types[name])) for i, name in enumerate(wanted)
+    }
+
+
+def column_type(name: str, of_file: np.dtype) -> np.dtype:
+    """The type of a column in memory: that of the file for channels, else float64."""
+    return of_file.newbyteorder("=") if name in CHANNEL_COLUMNS else np.dtype(np.float64)
 
 
 def text_encoding(path: Path) -> str:

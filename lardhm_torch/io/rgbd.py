@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lardhm_torch.channels import COLOR
+from lardhm_torch.io.color_images import color_beside, listed_colors, read_colors
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import natural_key
 from lardhm_torch.io.pose_files import read_trajectory
@@ -58,6 +60,7 @@ class Camera:
 class _Frame:
     image: Path
     pose: NDArray[np.float64]  # (4, 4) world_from_camera
+    color: Path | None = None
 
 
 def is_rgbd_folder(folder: Path) -> bool:
@@ -78,6 +81,9 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
     A pixel of depth 0 or 65535 has none. Images without a pose are left out, with a warning. A
     negative fy means that y points up in the images' poses (ICL-NUIM).
 
+    Color images of the same size are taken as registered to the depth images, pixel by pixel:
+    frame-000000.color.png or .jpg; of TUM those that rgb.txt or the pairs of the list name.
+
     Raises:
         ImportError: pillow is not installed.
         ValueError: an image, a pose or the intrinsics cannot be read, or no image has a pose.
@@ -91,19 +97,46 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
         raise ValueError(f"an image with a pose is needed; got {without_pose} without")
     intrinsics = camera.intrinsics or _read_intrinsics(folder)
     scale = camera.depth_scale or (1000 if image_list is None else 5000)
-    ends, counts = [], []
+    ends, counts, colors = [], [], []
     for frame in frames:
-        points = _image_points(frame.image, intrinsics, scale, camera.pixel_step)
+        points, color = _image_points(frame, intrinsics, scale, camera.pixel_step)
         ends.append(move_points(frame.pose, points))
         counts.append(len(points))
+        colors.append(color)
     if not any(counts):
         raise ValueError("at least one pixel with a depth is needed; got none")
     return Readout(
         np.concatenate(ends),
         origins=np.stack([frame.pose[:3, 3] for frame in frames]),
         scan_id=np.repeat(np.arange(len(frames)), counts),
-        notes=_notes(camera, image_list, without_pose),
+        notes=(*_notes(camera, image_list, without_pose), *_color_notes(frames, colors)),
+        channels=_color_channel(colors, counts),
     )
+
+
+def _color_channel(
+    colors: list[NDArray[np.float32] | None], counts: list[int]
+) -> dict[str, NDArray[np.float32]]:
+    """The colors of all pixels, NaN in images without one; nothing if none has."""
+    if all(color is None for color in colors):
+        return {}
+    parts = [
+        np.full((count, 3), np.nan, np.float32) if color is None else color
+        for color, count in zip(colors, counts, strict=True)
+    ]
+    return {COLOR: np.concatenate(parts)}
+
+
+def _color_notes(frames: list[_Frame], colors: list[NDArray[np.float32] | None]) -> list[Note]:
+    """What was assumed of the color images."""
+    used = sum(color is not None for color in colors)
+    unused = sum(frame.color is not None for frame in frames) - used
+    notes = [Note("color images taken as registered to the depth images", used)] if used else []
+    if unused:
+        notes.append(
+            Note("color images of another size than the depth images are left out", unused)
+        )
+    return notes
 
 
 def _notes(camera: Camera, image_list: Path | None, without_pose: int) -> tuple[Note, ...]:
@@ -142,19 +175,20 @@ def _seven_scenes_frames(folder: Path) -> tuple[list[_Frame], int]:
             raise ValueError(f"{source.name} must hold 4 x 4 numbers; got {pose.shape}")
         if np.isfinite(pose).all():
             check_rigid(pose[None], source.name)
-            frames.append(_Frame(image, pose))
+            frames.append(_Frame(image, pose, color_beside(image)))
     return frames, len(images) - len(frames)
 
 
 def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
     """The images that are listed, and how many are too far in time from a pose."""
-    stamps, images = [], []
+    stamps, images, paired = [], [], []
     for line in image_list.read_text(text_encoding(image_list)).splitlines():
         words = line.partition("#")[0].replace(",", " ").split()
         if words:
-            stamp, name = _depth_entry(words, image_list.name)
+            (stamp, name), other = _depth_entry(words, image_list.name)
             stamps.append(stamp)
             images.append(folder / name)
+            paired.append(None if other is None else folder / other)
     source = find_beside(image_list, (_TUM_POSES,))
     poses = None if source is None else read_trajectory(source)
     if not isinstance(poses, Trajectory) or not len(poses.stamps):
@@ -163,16 +197,17 @@ def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
             "stamp tx ty tz qx qy qz qw a line"
         )
     found, gaps = poses.at(np.array(stamps))
+    colors = [a or b for a, b in zip(paired, listed_colors(folder, stamps), strict=True)]
     frames = [
-        _Frame(image, pose)
-        for image, pose, gap in zip(images, found, gaps, strict=True)
+        _Frame(image, pose, color if color is not None and color.is_file() else None)
+        for image, pose, gap, color in zip(images, found, gaps, colors, strict=True)
         if gap <= MAX_STAMP_GAP
     ]
     return frames, len(images) - len(frames)
 
 
-def _depth_entry(words: list[str], name: str) -> tuple[float, str]:
-    """Stamp and file of the depth image in a line of one or two pairs of them.
+def _depth_entry(words: list[str], name: str) -> tuple[tuple[float, str], str | None]:
+    """Stamp and file of the depth image in a line of one or two pairs of them, and the other file.
 
     Of two images the one whose path says depth is it, else the first.
     """
@@ -183,8 +218,9 @@ def _depth_entry(words: list[str], name: str) -> tuple[float, str]:
             f"{name} must have a stamp and a file in each line; got {' '.join(words)!r}"
         )
     named = [pair for pair in pairs if "depth" in pair[1].lower()]
-    stamp, image = named[0] if len(named) == 1 else pairs[0]
-    return float(stamp), image
+    chosen = named[0] if len(named) == 1 else pairs[0]
+    others = [image for pair in pairs if pair is not chosen for image in pair[1:]]
+    return (float(chosen[0]), chosen[1]), others[0] if others else None
 
 
 def _is_stamp(word: str) -> bool:
@@ -231,16 +267,21 @@ def _check_intrinsics(values: tuple[Any, ...], name: str) -> tuple[float, float,
 
 
 def _image_points(
-    path: Path, intrinsics: tuple[float, float, float, float], per_meter: float, pixel_step: int
-) -> NDArray[np.float64]:
-    """(n, 3) points of the pixels with a depth, camera frame: x right, y down, z ahead [m]."""
-    depth = _read_depth(path)[::pixel_step, ::pixel_step]
+    frame: _Frame, intrinsics: tuple[float, float, float, float], per_meter: float, pixel_step: int
+) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    """(n, 3) points of the pixels with a depth, camera frame: x right, y down, z ahead [m]; colors."""
+    whole = _read_depth(frame.image)
+    colors = None if frame.color is None else read_colors(frame.color, whole.shape)
+    depth = whole[::pixel_step, ::pixel_step]
     rows, columns = np.nonzero((depth != _NO_DEPTH[0]) & (depth != _NO_DEPTH[1]))
     fx, fy, cx, cy = intrinsics
     ahead = depth[rows, columns] / per_meter
     right = (columns * pixel_step - cx) / fx * ahead
     down = (rows * pixel_step - cy) / fy * ahead
-    return np.stack([right, down, ahead], axis=1)
+    points = np.stack([right, down, ahead], axis=1)
+    if colors is None:
+        return points, None
+    return points, colors[::pixel_step, ::pixel_step][rows, columns]
 
 
 def _read_depth(path: Path) -> NDArray[np.float64]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.io.bag_chunks import Message
+from lardhm_torch.io.channel_columns import CHANNEL_COLUMNS, channels_from_columns
 from lardhm_torch.io.ros_messages import frame_name, stamp_and_frame
 
 CLOUDS = (
@@ -20,6 +21,7 @@ CLOUDS = (
     "livox_interfaces/CustomMsg",
 )
 _FLOATS = {7: "f4", 8: "f8"}  # PointField's numbers of FLOAT32 and FLOAT64
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", **_FLOATS}
 _LIVOX_POINT = [("time", "u4"), ("xyz", "3f4"), ("rest", "3u1")]  # reflectivity, tag, line
 
 
@@ -34,6 +36,7 @@ class Cloud:
         points: (n, 3) ends of the rays [m].
         is_return: (n,) False where the beam met nothing up to its end; None: all met something.
         num_invalid: points or beams of the message that are none, and were left out.
+        channels: (n, ...) values of the points by name, see `channel_columns`.
     """
 
     stamp: float
@@ -42,6 +45,7 @@ class Cloud:
     points: NDArray[np.float64]
     is_return: NDArray[np.bool_] | None = None
     num_invalid: int = 0
+    channels: dict[str, NDArray] = field(default_factory=dict)
 
 
 def read_cloud(message: Message, decode: Any) -> Cloud:
@@ -52,7 +56,7 @@ def read_cloud(message: Message, decode: Any) -> Cloud:
     Raises:
         ValueError: the message promises more than it holds.
     """
-    seconds = 1e-9 * message.recorded
+    seconds, channels = 1e-9 * message.recorded, dict[str, NDArray]()
     if message.kind.endswith("/CustomMsg"):
         stamp, frame, points = _livox_points(message)
         stamp = stamp or seconds
@@ -62,12 +66,13 @@ def read_cloud(message: Message, decode: Any) -> Cloud:
         if message.kind.endswith("/LaserScan"):
             points, is_return, num_invalid = laser_points(content)
             return Cloud(stamp, message.recorded, frame, points, is_return, num_invalid)
-        points = cloud_points(content)
+        points, channels = cloud_points(content), cloud_channels(content)
     is_zero = points[:, 0] == 0
     if is_zero.any():
         is_zero &= ~points.any(axis=1)
         points = points[~is_zero]
-    return Cloud(stamp, message.recorded, frame, points, None, int(is_zero.sum()))
+        channels = {name: values[~is_zero] for name, values in channels.items()}
+    return Cloud(stamp, message.recorded, frame, points, None, int(is_zero.sum()), channels)
 
 
 def laser_points(
@@ -101,21 +106,32 @@ def cloud_points(cloud: Any) -> NDArray[np.float64]:
     fields = {f.name: f for f in cloud.fields if f.name in ("x", "y", "z")}
     if len(fields) != 3:
         raise ValueError(f"a cloud needs the fields x, y, z; got {', '.join(fields) or 'none'}")
-    row_step = _row_step(cloud)
-    order = ">" if cloud.is_bigendian else "<"
+    _row_step(cloud)  # refuses clouds that are too short before anything is allocated
     points = np.empty((cloud.height * cloud.width, 3))
     for column, name in enumerate(("x", "y", "z")):
         if fields[name].datatype not in _FLOATS:
             raise ValueError(f"field {name} must be float32 or float64; it is neither")
-        kind = np.dtype(order + _FLOATS[fields[name].datatype])
-        if fields[name].offset + kind.itemsize > cloud.point_step:
-            raise _too_short(cloud)
-        if not len(points):
-            continue
-        strides, shape = (row_step, cloud.point_step), (cloud.height, cloud.width)
-        values = np.ndarray(shape, kind, cloud.data, fields[name].offset, strides)
-        points[:, column] = values.reshape(-1)
+        points[:, column] = _field_values(cloud, fields[name])
     return points
+
+
+def cloud_channels(cloud: Any) -> dict[str, NDArray]:
+    """Fields rgb, rgba, intensity, label, ring and others of `channel_columns` of a PointCloud2."""
+    fields = [f for f in cloud.fields if f.name in CHANNEL_COLUMNS and f.datatype in _NUMBERS]
+    columns = {f.name: _field_values(cloud, f) for f in fields if getattr(f, "count", 1) <= 1}
+    return channels_from_columns(columns)
+
+
+def _field_values(cloud: Any, entry: Any) -> NDArray:
+    """(n,) values of a field of a PointCloud2."""
+    kind = np.dtype((">" if cloud.is_bigendian else "<") + _NUMBERS[entry.datatype])
+    if entry.offset + kind.itemsize > cloud.point_step:
+        raise _too_short(cloud)
+    strides, shape = (_row_step(cloud), cloud.point_step), (cloud.height, cloud.width)
+    if not cloud.height * cloud.width:
+        return np.empty(0, kind.newbyteorder("="))
+    values = np.ndarray(shape, kind, cloud.data, entry.offset, strides)
+    return values.reshape(-1).astype(kind.newbyteorder("="))
 
 
 def _row_step(cloud: Any) -> int:

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -234,8 +234,7 @@ def iter_scans(
                 used, scan_id = scan.scan_id.unique(return_inverse=True)
             else:
                 used, scan_id = torch.tensor([number]), torch.zeros_like(scan.scan_id)
-            origins = scans.origins[used]
-            yield Scans(origins, scan.ends, scan_id, scan.is_return, scan.target_index)
+            yield replace(scan, origins=scans.origins[used], scan_id=scan_id)
 
 
 def iter_pieces(
@@ -321,7 +320,9 @@ def save_scans(scans: Scans, path: PathLike) -> None:
         "is_return": scans.is_return,
         "target_index": scans.target_index,
     }
-    write_npz(target, {name: value.detach().cpu().numpy() for name, value in columns.items()})
+    arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
+    channels = {name: value.cpu().numpy() for name, value in scans.channels.items()}
+    write_npz(target, arrays, channels)
 
 
 def load_points(path: PathLike) -> Tensor:

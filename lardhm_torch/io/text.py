@@ -25,6 +25,7 @@ _ARRAYS = ("points", "coords", "points_m_xyz")  # of ParaView, PDAL, VeloView
 _OTHER_NAMES = {f"{name}{mark}{i}": "xyz"[i] for name in _ARRAYS for mark in ":_" for i in range(3)}
 _OTHER_NAMES |= {"easting": "x", "northing": "y", "east": "x", "north": "y"}
 _OTHER_NAMES |= dict.fromkeys(("height", "elevation", "altitude", "up"), "z")
+_OTHER_NAMES |= {"r": "red", "g": "green", "b": "blue"}
 _UNIT_ENDING = re.compile(r"(_m|/m)$")
 _POSITION = re.compile(r"(?:pos|position|point|coord|cartesian)_?([xyz])")
 _COUNTED = 3  # a first column that counts so many rows or more is no coordinate
@@ -134,7 +135,7 @@ def _read_counted(path: Path, layout: _Layout, wanted: dict[str, int]) -> Readou
         return readout
     note = Note("tables of points, each taken for a scan", len(tables))
     scan_id = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
-    return Readout(readout.ends, scan_id=scan_id, notes=(note,))
+    return Readout(readout.ends, scan_id=scan_id, notes=(note,), channels=readout.channels)
 
 
 def _first_lines(path: Path) -> list[str]:

@@ -78,5 +78,6 @@ def forget(known: MapState, before: Tensor) -> MapState:
     return replace(
         known,
         evidence=first_points(known.evidence, torch.where(lost, 0, kept)),
+        channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
         fresh=torch.where(changed | lost, kept.to(known.fresh), known.fresh),
     )

@@ -13,6 +13,7 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.learning.changes import changes_map
+from lardhm_torch.learning.channel_sums import joint_layout, moved_sums, with_layout
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
@@ -80,6 +81,7 @@ def moved(
             state.evidence.isfinite(), torch.inf
         ),
         scatters=scatters.to(state.scatters.dtype),
+        channel_sums=moved_sums(state.channel_sums, rotation, shift),
     )
     return after, new_origin
 
@@ -173,7 +175,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         A new map, in the frame of the first.
 
     Raises:
-        ValueError: the settings differ.
+        ValueError: the settings differ, or a channel has different numbers of values.
 
     Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, applied to two maps.
     """
@@ -185,9 +187,13 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     if len(second) == 0:
         return joined
     ours, theirs = read_state(first), read_state(second)
+    layout = joint_layout(first.channel_layout, second.channel_layout)
+    is_trained = first.class_weights is not None or second.class_weights is not None
+    ours = with_layout(ours, first.channel_layout, layout, is_trained)
+    theirs = with_layout(theirs, second.channel_layout, layout, is_trained)
     if len(first) == 0:
         taken = MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True)))
-        write_state(joined, taken, second.origin.clone())
+        write_state(joined, taken, second.origin.clone(), layout)
         return joined
     shift = (second.origin - first.origin).to(ours.means)
     theirs = MapState(*(t.to(o) for t, o in zip(theirs, ours, strict=True)))
@@ -196,10 +202,12 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         centers=theirs.centers + shift,
         means=theirs.means + shift,
         evidence=theirs.evidence + shift,
+        channel_sums=moved_sums(theirs.channel_sums, torch.eye(len(shift)), shift),
     )
     rng = seeded_generator(seed, "merge_maps", shift.device)
     pooled = _pooled(ours, theirs, first.kernel)
-    write_state(joined, _retrained(pooled, ours, theirs, first.kernel, rng), first.origin.clone())
+    state = _retrained(pooled, ours, theirs, first.kernel, rng)
+    write_state(joined, state, first.origin.clone(), layout)
     return joined
 
 
@@ -230,6 +238,7 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
         factor_covariances(c.scatters / c.counts.clamp(min=1)[:, None, None], floor)
         for c in (before.clusters, pooled)
     ]
+    both_sums = torch.cat([before.channel_sums, others.channel_sums])
     after = MapState(
         average(before.weights, others.weights),
         average(before.centers, others.centers),
@@ -242,6 +251,8 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
         torch.zeros_like(before.losses),
         before.doubts,
         before.fresh,
+        torch.zeros_like(before.channel_sums).index_add_(0, rows, both_sums),
+        average(before.class_weights, others.class_weights),
     )
     rest = theirs.rows(~is_matched)
     tail = MapState(*(torch.cat(pair) for pair in zip(after, rest, strict=True)))

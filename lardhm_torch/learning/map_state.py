@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,9 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.clustering import Clusters, Columns
 
 EVIDENCE = 32  # E, number of points that a cluster keeps
+PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
+HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
+CHANNELS = ("channel_sums", "class_weights")  # None in a map without them
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +23,8 @@ class MapState(Columns):
     ``evidence`` is (M, E, D), see `evidence`. ``losses`` is (M,): the mean loss of the points that a
     cluster keeps, 0 if it has not been computed. ``doubts`` is (M,), see `forgetting`.
     ``fresh`` is (M,): the number of kept points that the weights have not been trained on.
+    ``channel_sums`` is (M, R, 1 + D) float64, see `channel_sums`; ``class_weights`` (M, K). R, K are 0
+    in a map without channels or without trained classes.
     """
 
     weights: Tensor
@@ -33,6 +38,8 @@ class MapState(Columns):
     losses: Tensor
     doubts: Tensor
     fresh: Tensor
+    channel_sums: Tensor
+    class_weights: Tensor
 
     def rows(self, which: Tensor) -> MapState:
         """Copies of the clusters selected by a mask or by indices, in that order."""
@@ -40,8 +47,12 @@ class MapState(Columns):
         return MapState(*(tensor.index_select(0, which) for tensor in self))
 
     def put(self, where: Tensor, part: MapState) -> MapState:
-        """A copy with rows ``where`` replaced by the first rows of ``part``, and its others appended."""
+        """A copy with rows ``where`` replaced by the first rows of ``part``, and its others appended.
+
+        Columns of channels that ``part`` does not have are 0.
+        """
         count = len(where)
+        part = replace(part, **{name: _widened(part, self, name) for name in CHANNELS})
         return MapState(
             *(
                 torch.cat([ours, theirs[count:]]).index_copy_(0, where, theirs[:count])
@@ -64,6 +75,16 @@ class MapState(Columns):
         return Clusters(self.counts, self.means, self.scatters)
 
 
+def _widened(part: MapState, like: MapState, name: str) -> Tensor:
+    """A tensor of a state with as many rows per cluster as that of another; added ones are 0."""
+    values: Tensor = getattr(part, name)
+    missing = getattr(like, name).shape[1] - values.shape[1]
+    if not missing:
+        return values
+    added = values.new_zeros(len(values), missing, *values.shape[2:])
+    return torch.cat([values, added], dim=1)
+
+
 def new_rows(
     clusters: Clusters, is_occupied: Tensor, floor: float, evidence: Tensor | None = None
 ) -> MapState:
@@ -80,9 +101,14 @@ def new_rows(
     if evidence is None:
         evidence = no_evidence(clusters.means)
     raw = raw_factors(factors)
-    zeros = (weights.clone() for _ in range(3))
+    zeros = (weights.clone(), weights.clone(), weights.clone())
     moments = (clusters.counts, clusters.means, clusters.scatters)
-    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros)
+    dim = clusters.means.shape[1]
+    no_sums = weights.new_zeros(len(weights), 0, 1 + dim, dtype=torch.float64)
+    no_classes = weights.new_zeros(len(weights), 0)
+    return MapState(
+        weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, no_sums, no_classes
+    )
 
 
 def no_evidence(means: Tensor) -> Tensor:

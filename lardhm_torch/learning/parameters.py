@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import fields
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.changes import normal_tensors
-from lardhm_torch.learning.map_state import EVIDENCE, MapState, no_evidence
-from lardhm_torch.learning.state_checks import check_settings, check_values
+from lardhm_torch.learning.channel_sums import Layout, no_sums
+from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState
+from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
+from lardhm_torch.learning.state_checks import check_settings
+from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
-PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
-HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
-SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
+AnyMap = TypeVar("AnyMap", bound="MapParameters")
 
 # OpenMP hangs in the child of a fork whose parent used it; DataLoader workers have one thread, too.
 os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
@@ -46,6 +47,8 @@ class MapParameters(nn.Module):
     posterior_variances: Tensor
     posterior_scales: Tensor
     origin: Tensor
+    channel_sums: Tensor | None
+    class_weights: nn.Parameter | None
 
     def __init__(
         self,
@@ -65,6 +68,8 @@ class MapParameters(nn.Module):
         self.min_lengthscale = float(min_lengthscale)
         with normal_tensors():
             self._register_empty(dim, device, dtype)
+        self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
+        self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
         self._index = torch.empty(0, dtype=torch.uint8)
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self.register_load_state_dict_pre_hook(make_room)
@@ -97,9 +102,11 @@ class MapParameters(nn.Module):
             "posterior_variances": weights.new_zeros(0),
             "posterior_scales": weights.new_ones(2),
             "origin": weights.new_zeros(dim, dtype=torch.float64),
+            "channel_sums": None,
         }
         for name, tensor in buffers.items():
             self.register_buffer(name, tensor)
+        self.register_parameter("class_weights", None)
 
     def __len__(self) -> int:
         """Number of clusters M."""
@@ -144,6 +151,16 @@ class MapParameters(nn.Module):
             {"params": [self.centers, self.raw_scale_tril], "weight_decay": 0.0},
         ]
 
+    def drop_channels(self: AnyMap) -> AnyMap:
+        """Remove channels and classes from the map. The occupancy does not change.
+
+        Returns:
+            This map.
+        """
+        set_channels(self, {}, has_class_weights=False)
+        self.class_scale = 1.0
+        return self
+
     def extra_repr(self) -> str:
         """Number of clusters and settings, for `print(model)`."""
         settings = ", ".join(f"{name}={value}" for name, value in self.settings.items())
@@ -151,18 +168,22 @@ class MapParameters(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Format version and settings, stored in the state dict with the tensors."""
-        return {"format_version": map_files.FORMAT_VERSION, **self.settings}
+        state = {"format_version": map_files.FORMAT_VERSION, **self.settings}
+        if self.channel_layout:
+            state |= {"channels": self.channel_layout, "class_scale": self.class_scale}
+        return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Do nothing: `make_room` has already checked that the settings agree."""
 
     def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
-        """Cast all tensors except the origin, which remains float64 (`.to()`, `.float()`, ...)."""
-        origin = self.origin
+        """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""
+        exact = {"origin": self.origin, "channel_sums": self.channel_sums}
         with normal_tensors():
             super()._apply(fn, recurse)
-        if self.origin.dtype != torch.float64:
-            self.origin = origin.to(self.origin.device)
+        for name, tensor in exact.items():
+            if tensor is not None and getattr(self, name).dtype != torch.float64:
+                setattr(self, name, tensor.to(getattr(self, name).device))
         return self
 
 
@@ -171,118 +192,21 @@ def at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
-def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> None:
-    """Change the number of clusters. Parameters remain the same objects, so optimizers stay valid.
-
-    Args:
-        model: a map.
-        num_clusters: new number of clusters.
-        keep: True: keep the values of the clusters, and allocate spare capacity, so that repeated
-            small growth does not copy the map each time. False: set all values to 0.
-    """
-    if len(model) == num_clusters:
-        return
-    with normal_tensors():
-        for name, tensor in list(model.state_tensors()):
-            if name in PER_MAP:
-                continue
-            room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
-            if isinstance(tensor, nn.Parameter):
-                _set_shape(tensor, room)
-            else:
-                setattr(model, name, room)
-
-
-def _zeros(tensor: Tensor, rows: int) -> Tensor:
-    return tensor.detach().new_zeros(rows, *tensor.shape[1:])
-
-
-def _with_rows(model: MapParameters, name: str, rows: int) -> Tensor:
-    """The tensor with a different number of rows. Added rows are 0.
-
-    The storage is reused if it is large enough and was allocated by this function. Any other storage
-    may be shared with other tensors.
-    """
-    tensor = getattr(model, name).detach()
-    storage, before = tensor.untyped_storage(), len(tensor)
-    made_here = model._spare_storages.get(name) == (storage.data_ptr(), storage.nbytes())
-    bytes_per_row = tensor.element_size() * tensor[:1].numel() if before else 0
-    if not made_here or not 0 < rows * bytes_per_row <= storage.nbytes():
-        reserve = _zeros(tensor, rows + int(SPARE_FRACTION * rows))
-        reserve[: min(rows, before)] = tensor[:rows]
-        storage = reserve.untyped_storage()
-        model._spare_storages[name] = (storage.data_ptr(), storage.nbytes())
-        return reserve[:rows]
-    resized = tensor.as_strided((rows, *tensor.shape[1:]), tensor.stride(), 0)
-    resized[before:] = 0
-    return resized
-
-
-def _set_shape(parameter: nn.Parameter, room: Tensor) -> None:
-    """Change the shape of a parameter in place, even if it is part of an autograd graph.
-
-    The temporary change of dtype makes autograd discard the old shape. New graphs then compute
-    gradients of the new shape, and backpropagation through an old graph raises an error.
-    (`torch.utils.swap_tensors` fails as long as a graph exists.)
-    """
-    parameter.grad = None
-    parameter.data = room.new_empty(
-        0, dtype=torch.float32 if room.dtype == torch.float64 else torch.float64
-    )
-    parameter.data = room
-
-
-def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Pre-hook of `load_state_dict`: validate the state dict and adopt its number of clusters."""
-    extra = map_files.check_settings(state.get(prefix + "_extra_state"))
-    differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
-    if differing:
-        name, (ours, theirs) = next(iter(differing.items()))
-        raise ValueError(
-            f"state_dict must be of a map with {name} = {ours}; got {theirs}. "
-            f"Make the map with LardHilbertMap({name}={theirs}), or read the file with "
-            "LardHilbertMap.load"
-        )
-    _fill_evidence(state, prefix)
-    own = dict(model.state_tensors())
-    missing = [name for name in own if not isinstance(state.get(prefix + name), Tensor)]
-    if missing:
-        raise ValueError(f"state_dict must hold the tensors of a map; missing: {missing}")
-    num_clusters = len(torch.atleast_1d(state[prefix + "weights"]))
-    for name, tensor in own.items():
-        shape = tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
-        if state[prefix + name].shape != torch.Size(shape):
-            raise ValueError(
-                f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
-                f"got {tuple(state[prefix + name].shape)}"
-            )
-    check_values({name: state[prefix + name] for name in own})
-    resize(model, num_clusters)
-
-
-def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
-    """Add empty evidence to the state dict of a map that was saved without it."""
-    centers = state.get(prefix + "centers")
-    if not isinstance(centers, Tensor) or centers.ndim != 2:
-        return
-    for name in HISTORY:
-        if len(state.get(prefix + name, ())) == 0:
-            rows = centers.new_zeros(len(centers))
-            state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
-
-
-def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
-    for name, _tensor in model.state_tensors():
-        state[prefix + name] = map_files.without_spare_memory(state[prefix + name])
-
-
 def read_state(model: MapParameters) -> MapState:
     """The tensors of the map, detached but not copied."""
-    return MapState(*(getattr(model, field.name).detach() for field in fields(MapState)))
+    none = {
+        "channel_sums": no_sums(model.centers.detach(), {}),
+        "class_weights": model.weights.detach().new_zeros(len(model), 0),
+    }
+    tensors = {field.name: getattr(model, field.name) for field in fields(MapState)}
+    return MapState(
+        *(none[name] if tensor is None else tensor.detach() for name, tensor in tensors.items())
+    )
 
 
-def write_state(model: MapParameters, state: MapState, origin: Tensor) -> None:
+def write_state(
+    model: MapParameters, state: MapState, origin: Tensor, layout: Layout | None = None
+) -> None:
     """Replace the clusters and the origin of a map. If anything fails, the map is unchanged.
 
     Parameters remain the same objects, so existing optimizers stay valid. If an optimizer holds state
@@ -292,17 +216,21 @@ def write_state(model: MapParameters, state: MapState, origin: Tensor) -> None:
         model: map, changed in place.
         state: M clusters.
         origin: (D,) float64, world = map + origin [m].
+        layout: of the channels of the state; None: that of the map.
     """
+    old_layout = model.channel_layout
     before = MapState(*(tensor.clone() for tensor in read_state(model)))
     try:
-        assign_state(model, state)
+        assign_state(model, state, layout)
     except BaseException:
-        assign_state(model, before)
+        assign_state(model, before, old_layout)
         raise
     model.origin = origin
 
 
-def write_rows(model: MapParameters, where: Tensor, part: MapState, removed: Tensor) -> None:
+def write_rows(
+    model: MapParameters, where: Tensor, part: MapState, removed: Tensor, layout: Layout
+) -> None:
     """Overwrite rows of a map, append new ones, and remove others. If it fails, nothing changes.
 
     The cost depends on the number of changed rows, not on the size of the map. The last rows of the
@@ -313,7 +241,9 @@ def write_rows(model: MapParameters, where: Tensor, part: MapState, removed: Ten
         where: (Q,) rows to overwrite.
         part: Q rows to write there, followed by the clusters to append.
         removed: (R,) rows to remove; clusters are only appended if R = 0.
+        layout: of the channels of ``part``; it continues that of the map.
     """
+    old_layout, old = model.channel_layout, read_state(model)
     size = len(model)
     left = size + len(part) - len(where) - len(removed)
     tail = torch.arange(left, max(left, size), device=removed.device)
@@ -321,12 +251,17 @@ def write_rows(model: MapParameters, where: Tensor, part: MapState, removed: Ten
     touched = torch.cat([where, holes, tail])
     before = read_state(model).rows(touched)
     try:
+        extend_channels(model, layout)
         resize(model, size + len(part) - len(where), keep=True)
         assign_rows(model, where, part)
         if len(removed):
             assign_rows(model, holes, read_state(model).rows(tail[~torch.isin(tail, removed)]))
             resize(model, left, keep=True)
     except BaseException:
+        if model.channel_layout != old_layout:
+            model.channel_layout = old_layout
+            model.channel_sums = old.channel_sums if old_layout else None
+            set_class_weights(model, old.class_weights)
         resize(model, size, keep=True)
         assign_rows(model, touched, before)
         raise
@@ -341,14 +276,19 @@ def assign_rows(model: MapParameters, where: Tensor, part: MapState) -> None:
         tensor[len(tensor) - added :] = rows[count:]
 
 
-def assign_state(model: MapParameters, state: MapState) -> None:
+def assign_state(model: MapParameters, state: MapState, layout: Layout | None = None) -> None:
     """Copy the tensors of a state into a map, and reset the posterior of the weights."""
+    layout = model.channel_layout if layout is None else layout
     resize(model, len(state.weights))
+    model.channel_layout = layout
+    model.channel_sums = state.channel_sums.clone() if layout else None
+    set_class_weights(model, state.class_weights)
     model.posterior_variances.zero_()
     model.posterior_scales.fill_(1.0)
     with torch.no_grad():
         for field, value in zip(fields(state), state, strict=True):
-            getattr(model, field.name).copy_(value)
+            if field.name not in CHANNELS:
+                getattr(model, field.name).copy_(value)
 
 
 def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> None:

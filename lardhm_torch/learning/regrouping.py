@@ -114,22 +114,36 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     parents, share = known.rows(rows), sizes[0] / sizes.sum(dim=0)
     counts = (parents.counts * share).round().to(parents.counts)
     parts = [
-        _of_evidence(evidence, count, rule, parents)
-        for evidence, count in ((first, counts), (second, parents.counts - counts))
+        _half(parents, evidence, count, part, rule)
+        for evidence, count, part in (
+            (first, counts, share),
+            (second, parents.counts - counts, 1 - share),
+        )
     ]
     both = MapState(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
     divided = torch.cat([divided.index_fill(0, rows, True), divided.new_ones(len(rows))])
     return known.put(rows, both), divided
 
 
-def _of_evidence(evidence: Tensor, counts: Tensor, rule: Rule, parents: MapState) -> MapState:
-    """Clusters with the moments of their evidence, which represents ``counts`` points."""
+def _half(
+    parents: MapState, evidence: Tensor, counts: Tensor, fraction: Tensor, rule: Rule
+) -> MapState:
+    """Clusters with the moments of their evidence, which represents ``counts`` points.
+
+    They have a fraction of the parents' channels.
+    """
     found = evidence_moments(evidence)
     clusters = _represented(found, torch.zeros_like(counts) if rule.kind == 2 else counts)
     is_occupied = torch.full_like(counts, rule.kind == 0, dtype=torch.bool)
     rows = new_rows(clusters, is_occupied, rule.floor, evidence)
-    fresh = kept_counts(evidence).to(parents.fresh)
-    return replace(rows, weights=parents.weights, doubts=parents.doubts, fresh=fresh)
+    return replace(
+        rows,
+        weights=parents.weights,
+        doubts=parents.doubts,
+        fresh=kept_counts(evidence).to(parents.fresh),
+        channel_sums=parents.channel_sums * fraction[:, None, None],
+        class_weights=parents.class_weights,
+    )
 
 
 def _represented(found: Clusters, counts: Tensor) -> Clusters:

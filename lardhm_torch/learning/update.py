@@ -17,6 +17,7 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import kernels_near
+from lardhm_torch.learning.channel_sums import handed_over
 from lardhm_torch.learning.cluster_matching import merge_clusters
 from lardhm_torch.learning.clustering import (
     FEW_POINTS,
@@ -109,6 +110,7 @@ def updated(
     part = replace(part, doubts=doubted(part, points, labels, kernel, index))
     part = _regrouped(forget(part, before), points, labels, num_clusters, few, task)
     alive = kept_counts(part.evidence) > 0
+    part = handed_over(part, alive)
     part = retrained(part.rows(alive), config.max_trained, kernel, config.fit, rng)
     return _without(nearby, part, alive)
 

@@ -155,6 +155,32 @@ def nearest_features(
     return torch.cat([chunk[0] for chunk in chunks]), torch.cat([chunk[1] for chunk in chunks])
 
 
+def mixture(
+    points: Tensor,
+    centers: Tensor,
+    raw_scale_tril: Tensor,
+    table: Tensor,
+    kernel: Kernel,
+    index: Tensor,
+    *,
+    sharp: bool,
+) -> Tensor:
+    """As `features.mixture` of `features.kernel_factors`."""
+    given = (points, centers, raw_scale_tril, table)
+    needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
+    if supports(points) and not needs_gradient:
+        return torch.ops.lardhm.mixture(
+            *(tensor.detach() for tensor in given), *kernel, index, sharp
+        )
+    parts = []
+    whole = torch.compiler.is_compiling()  # the exported graph must accept any number of points
+    for chunk in [points] if whole else points.split(features.QUERY_CHUNK):
+        indices = nearest_centers(chunk, centers, kernel.num_neighbors, index)
+        factors = features.kernel_factors(raw_scale_tril, kernel)
+        parts.append(features.mixture(chunk, centers, factors, table, indices, sharp=sharp))
+    return torch.cat(parts)
+
+
 def assign(
     points: Tensor, centers: Tensor, *, scatter: bool = True
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -234,6 +260,10 @@ def _register() -> None:
     def _(points: Tensor, centers: Tensor, raw: Tensor, index: Tensor, k: int, *_: Any) -> Any:
         shape = (points.shape[0], min(k, centers.shape[0]))
         return points.new_empty(shape, dtype=torch.int32), points.new_empty(shape)
+
+    @library.register_fake("lardhm::mixture")
+    def _(points: Tensor, centers: Tensor, raw: Tensor, table: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(points.shape[0], table.shape[1])
 
     @library.register_fake("lardhm::lattice_occupancy")
     def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:

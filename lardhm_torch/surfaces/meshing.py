@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, log_odds_variance, pieces, to_tensor
+from lardhm_torch.channels import CLASS
+from lardhm_torch.maps import (
+    OccupancyMap,
+    TensorLike,
+    channel_names,
+    log_odds_variance,
+    pieces,
+    to_tensor,
+)
 from lardhm_torch.queries.grids import (
     EVIDENCE,
     SURFACES,
@@ -16,6 +24,7 @@ from lardhm_torch.queries.grids import (
     grid_axes,
     threshold_log_odds,
 )
+from lardhm_torch.surfaces.channel_colors import class_labels
 from lardhm_torch.surfaces.estimate import check_mesh_memory, estimate_mesh
 from lardhm_torch.surfaces.following import Rule, follow_surface, seed_blocks
 from lardhm_torch.surfaces.lattice import Lattice, blocks_near_boxes, border_blocks
@@ -65,7 +74,10 @@ def extract_mesh(
         surface: "peak" or "crossing", as for `raycast`.
         color: of the vertices: "height", "cluster" (one color for each nearest supporting
             cluster), "probability" (at the center of that cluster), "variance" (of the log-odds,
-            dark where certain; needs `LardHilbertMap.fit_uncertainty`), or None.
+            dark where certain; needs `LardHilbertMap.fit_uncertainty`), the name of a channel of the
+            map ("color", "intensity", "class", ...; gray where it is unknown), or None. Meshes
+            colored by class have the class numbers as vertex attribute "label", -1 where unknown,
+            which `save_mesh` writes to .ply.
         evidence: log-odds required on both sides of a face, see above; None keeps all faces, which
             takes time and memory in proportion to the volume.
         progress: show a progress bar.
@@ -81,7 +93,8 @@ def extract_mesh(
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
     _check_meshing(model, resolution, threshold, evidence)
-    for name, value, allowed in (("surface", surface, SURFACES), ("color", color, (*COLORS, None))):
+    colors = (*COLORS, *channel_names(model), None)
+    for name, value, allowed in (("surface", surface, SURFACES), ("color", color, colors)):
         if value not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}; got {value!r}")
     if color == "variance":
@@ -184,11 +197,13 @@ def lattice_mesh(
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     vertices, normals, faces = vertices[used], normals[used], (np.cumsum(used) - 1)[faces]
+    has_labels = color == CLASS and len(vertices)
     return trimesh.Trimesh(
         vertices,
         faces,
         vertex_normals=normals if len(normals) else None,
         vertex_colors=vertex_colors(model, vertices, sign, color),
+        vertex_attributes={"label": class_labels(model, vertices)} if has_labels else None,
         process=False,
     )
 

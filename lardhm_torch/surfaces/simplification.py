@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def simplify_mesh(mesh: trimesh.Trimesh, num_faces: int) -> trimesh.Trimesh:
     """Simplify a mesh to about ``num_faces`` faces. Flat parts get large faces.
 
-    A closed mesh usually stays closed. Vertices get the color of the nearest vertex before.
+    A closed mesh usually stays closed. Vertices get color and label of the nearest vertex before.
 
     Args:
         mesh: the mesh [m].
@@ -50,7 +50,15 @@ def simplify_mesh(mesh: trimesh.Trimesh, num_faces: int) -> trimesh.Trimesh:
     )
     vertices = vertices.astype(np.float64) + middle
     visual: Any = mesh.visual
-    colors = None
-    if visual is not None and visual.kind == "vertex":
-        colors = visual.vertex_colors[cKDTree(mesh.vertices).query(vertices)[1]]
-    return trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
+    has_colors = visual is not None and visual.kind == "vertex"
+    attributes = dict(mesh.vertex_attributes)
+    if not has_colors and not attributes:
+        return trimesh.Trimesh(vertices, faces, process=False)
+    nearest = cKDTree(mesh.vertices).query(vertices)[1]
+    return trimesh.Trimesh(
+        vertices,
+        faces,
+        vertex_colors=visual.vertex_colors[nearest] if has_colors else None,
+        vertex_attributes={name: np.asarray(v)[nearest] for name, v in attributes.items()},
+        process=False,
+    )

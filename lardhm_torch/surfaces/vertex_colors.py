@@ -1,4 +1,4 @@
-"""Vertex colors of a surface: height, nearest cluster, its probability, or the map's uncertainty."""
+"""Vertex colors of a surface: height, nearest cluster, probability, uncertainty, or a channel."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, log_odds_variance
 from lardhm_torch.queries.grids import nearest_support
+from lardhm_torch.surfaces.channel_colors import channel_colors
 
 COLORS = ("height", "cluster", "probability", "variance")
 CHUNK_VERTICES = 1 << 18  # vertices evaluated at a time
@@ -23,7 +24,7 @@ def vertex_colors(
         model: the map.
         vertices: (V, 3) world positions [m].
         sign: of the weights of the clusters that "cluster" and "probability" refer to.
-        color: one of `COLORS`, or None.
+        color: one of `COLORS`, the name of a channel, or None.
 
     Returns:
         (V, 4) uint8 RGBA; None without vertices or with color None.
@@ -36,6 +37,8 @@ def vertex_colors(
         return colormaps["viridis"](_stretched(vertices[:, 2], 0.01), bytes=True)
     if color == "variance":
         return variance_colors(model, vertices)
+    if color not in COLORS:
+        return channel_colors(model, vertices, color)
     points = torch.as_tensor(np.array(vertices), device=model.origin.device)
     centers = nearest_support(model, points, sign).centers
     if color == "cluster":

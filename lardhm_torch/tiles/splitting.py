@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
-from lardhm_torch.learning.parameters import HISTORY, PER_MAP
+from lardhm_torch.learning.map_state import HISTORY, PER_MAP
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.indexing import Folder, tile_indices, tile_path
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, write_manifest
@@ -24,6 +24,11 @@ def split_map(model: LardHilbertMap, folder: Folder, edge: float) -> None:
     folder = Path(folder)
     if len(model) == 0:
         raise ValueError("the map must hold clusters to be split; it is empty: fit it first")
+    if model.channel_layout:
+        raise ValueError(
+            f"tiles cannot hold channels; the map has {', '.join(model.channel_layout)}. "
+            "Split a copy without them: copy.deepcopy(model).drop_channels()"
+        )
     if (folder / MANIFEST_NAME).exists():
         raise FileExistsError(f"{folder} must be a new folder; it holds a tiled map already")
     manifest = Manifest(

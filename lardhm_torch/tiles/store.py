@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.map_files import check_settings, decode_safetensors
-from lardhm_torch.learning.parameters import PER_MAP
+from lardhm_torch.learning.map_state import PER_MAP
 from lardhm_torch.learning.state_checks import check_values
 from lardhm_torch.tiles.entries import Tile
 from lardhm_torch.tiles.indexing import Folder, Index, tile_name, tile_path

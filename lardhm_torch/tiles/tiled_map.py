@@ -119,7 +119,7 @@ class TiledMap:
             edge: edge length of a tile [m].
 
         Raises:
-            ValueError: the map is empty, or edge is not > 0.
+            ValueError: the map is empty or has channels, or edge is not > 0.
             FileExistsError: the folder holds a tiled map already.
         """
         split_map(model, folder, edge)

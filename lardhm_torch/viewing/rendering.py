@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,7 @@ def render_mesh(
     cut_above: float | None = None,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     cull: bool = True,
+    legend: Mapping[str, tuple[int, int, int]] | None = None,
 ) -> np.ndarray:
     """Render a mesh: perspective, smooth shading, ambient occlusion, white background.
 
@@ -50,6 +52,7 @@ def render_mesh(
         cut_above: omit faces with a vertex higher than this along ``up``, such as a ceiling [m].
         up: direction that points up in the image; (0, -1, 0) in the frame of a camera.
         cull: cull back faces, so that walls do not hide the room behind them.
+        legend: RGB colors, 0 to 255, by the text beside them; None: no legend.
 
     Returns:
         (height, width, 3) uint8 RGB.
@@ -79,12 +82,35 @@ def render_mesh(
         image.reshape(-1, 3)[pixels] = color * brightness[:, None]
     small = image.reshape(size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3).mean(axis=(1, 3))
     result = small.clip(0, 255).astype(np.uint8)
+    if legend:
+        result = _with_legend(result, legend)
     if path is not None:
         from matplotlib.image import imsave
 
         with replaced_file(path) as partial:
             imsave(partial, result)
     return result
+
+
+def _with_legend(image: np.ndarray, legend: Mapping[str, tuple[int, int, int]]) -> np.ndarray:
+    """The (height, width, 3) image with a legend in its upper right corner."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    height, width = image.shape[:2]
+    figure = Figure(figsize=(width / 100, height / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.imshow(image, aspect="auto", interpolation="nearest")
+    axes.set_axis_off()
+    patches = [
+        Patch(color=(rgb[0] / 255, rgb[1] / 255, rgb[2] / 255), label=text)
+        for text, rgb in legend.items()
+    ]
+    axes.legend(handles=patches, loc="upper right", framealpha=0.9)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:height, :width, :3].copy()
 
 
 def render_slice(

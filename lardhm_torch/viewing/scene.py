@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.channels import COLOR
 from lardhm_torch.maps import OccupancyMap, covariance_scale
 from lardhm_torch.queries.grids import query_slice
 from lardhm_torch.scans import Scans
@@ -133,26 +134,30 @@ def painted_glb(mesh: trimesh.Trimesh) -> bytes:
 
 
 def scan_points(scans: Scans, limit: int, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) hits, at most about ``limit``, and (N, 3) uint8 gray levels by height."""
+    """(N, 3) hits, at most about ``limit``, and (N, 3) uint8 colors: their own, or gray by height."""
     from matplotlib import colormaps
 
-    hits = scans.hits
-    hits = in_space(hits[hits.isfinite().all(dim=1)].cpu())
-    points = thinned((hits.numpy() - offset).astype(np.float32), limit)
+    rays = scans.select(scans.is_return & scans.ends.isfinite().all(dim=1))
+    points = (in_space(rays.ends.cpu()).numpy() - offset).astype(np.float32)
+    rows = thinned_rows(points, limit)
+    points = points[rows]
+    if COLOR in rays.channels:
+        colors = rays.channels[COLOR].cpu()[torch.from_numpy(rows)].nan_to_num(nan=0.6)
+        return points, (255 * colors).round().to(torch.uint8).numpy()
     low, high = np.quantile(points[:, 2], [0.01, 0.99]) if len(points) else (0, 1)
     shades = 0.25 + 0.6 * (points[:, 2] - low) / max(high - low, 1e-9)
     return points, colormaps["gray"](shades, bytes=True)[:, :3]
 
 
-def thinned(points: np.ndarray, limit: int) -> np.ndarray:
-    """At most ``limit`` of (N, 3) points: the first in each voxel, with voxels as large as needed."""
+def thinned_rows(points: np.ndarray, limit: int) -> np.ndarray:
+    """Ascending rows of at most ``limit`` points: the first in each voxel, as large as needed."""
     kept, edge = np.arange(len(points)), 0.01
     while len(kept) > limit:
         cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
         sides = cells.max(axis=0) + 1
         kept = np.unique(np.ravel_multi_index(cells.T, sides), return_index=True)[1]
         edge *= max(1.02, (len(kept) / limit) ** 0.4)  # on surfaces the count goes with edge^-2
-    return points[np.sort(kept)]
+    return np.sort(kept)
 
 
 def quaternions(rotations: np.ndarray) -> np.ndarray:

@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from lardhm_torch.channels import CLASS, COLOR
 from lardhm_torch.io.atomic_files import replaced_file
-from lardhm_torch.maps import OccupancyMap, snapshot
+from lardhm_torch.maps import OccupancyMap, channel_names, snapshot
 from lardhm_torch.scans import Scans
 from lardhm_torch.surfaces.lattice import Lattice
 from lardhm_torch.surfaces.meshing import lattice_mesh, surface_lattice
 from lardhm_torch.surfaces.vertex_colors import COLORS, has_variance
+from lardhm_torch.viewing.legends import legend_html
 from lardhm_torch.viewing.scene import Stage, core_box, view_resolution
 
 CLOSING = 1.0  # [s] at most that `close` waits for what is being drawn
@@ -159,7 +161,10 @@ class MapViewer:
             self._threshold = gui.add_slider("threshold", 0.5, 0.99, 0.01, 0.5, hint=THRESHOLD_HINT)
             available = has_variance(self._model)
             colors = [color for color in COLORS if available or color != "variance"]
-            self._color = gui.add_dropdown("color", colors, initial_value="height")
+            colors += [name for name in channel_names(self._model) if name not in colors]
+            initial = COLOR if COLOR in colors else "height"
+            self._color = gui.add_dropdown("color", colors, initial_value=initial)
+            self._legend = gui.add_html("")
         self._stage.follow("/surface", show)
         self._threshold.on_update(lambda _: self._request("surface"))
         self._color.on_update(lambda _: self._request("surface"))
@@ -240,11 +245,13 @@ class MapViewer:
             if self._closed or (is_final and "surface" in self._jobs):
                 raise _OutdatedError
 
+        color = self._color.value
+        self._legend.content = legend_html(model) if color == CLASS else ""
         mesh = lattice_mesh(
             model,
             lattice,
             float(self._threshold.value),
-            color=self._color.value,
+            color=color,
             report=check,
         )
         check()

@@ -1,0 +1,224 @@
+"""Queries of a map: probability, log-odds, features, uncertainty, channels and classes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import channel_queries, native
+from lardhm_torch.channel_queries import ChannelSums
+from lardhm_torch.channels import CLASS
+from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
+from lardhm_torch.learning import parameters, posterior
+from lardhm_torch.learning.changes import normal_tensors
+from lardhm_torch.learning.parameters import at_least_float32
+from lardhm_torch.maps import TensorLike
+from lardhm_torch.native.surfaces import NativeMap
+from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame
+
+
+class MapQueries(parameters.MapParameters):
+    """What `LardHilbertMap` answers; see there."""
+
+    def forward(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
+        return self._query(points, probability=True)
+
+    def log_odds(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
+        return self._query(points, probability=False)
+
+    def features(self, points: TensorLike) -> Tensor:
+        """(N, D) world positions [m] -> sparse COO (N, M) with K values per row, eq. (9)."""
+        local = self._to_map_frame(points)
+        if local.ndim != 2:
+            raise ValueError(f"points must be (N, {self.dim}); got {tuple(local.shape)}")
+        centers = at_least_float32(self.centers)
+        indices = native.nearest_centers(local, centers, self.num_neighbors, self._fresh_index())
+        values = lard_kernel(local, centers, self.scale_tril, indices)
+        values = values * neighbor_fade(local, centers, indices)
+        return feature_matrix(indices, self._as_answer(values), len(self))
+
+    def variance(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (...) variance of the log-odds.
+
+        Far from all clusters it equals the variance of the prior.
+
+        Raises:
+            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
+        """
+        return self._as_answer(self._posterior(points)[1])
+
+    def bayesian_probability(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
+
+        Raises:
+            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
+        """
+        mean, variance = self._posterior(points)
+        return self._as_answer(posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance))
+
+    @property
+    def channels(self) -> dict[str, ChannelSums]:
+        """Sums of the channels over the hits of each cluster, by name; views of ``channel_sums``."""
+        return channel_queries.channel_sums_of(self)
+
+    def channel(self, points: TensorLike, name: str) -> Tensor:
+        """(..., D) world positions [m] -> (...) or (..., C) mean of a channel around them.
+
+        The means of the occupied clusters nearby are averaged with the fourth power of their features,
+        whose kernel has the covariance of the points of a cluster, times their numbers of hits. NaN
+        where no occupied cluster with a value is near. For ``"class"``: `class_probability`.
+
+        Raises:
+            ValueError: the map has no such channel.
+        """
+        return channel_queries.interpolate(self, points, name)
+
+    def class_log_odds(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (..., K) logarithms of the class odds, up to a constant.
+
+        K is the number of classes, in the order of ``classes``. The value is the logarithm of the
+        posterior of the class counts around a point, plus the trained class weights times the
+        features (`fit_classes`). It is differentiable with respect to the points, ``class_weights``,
+        ``centers`` and ``raw_scale_tril``.
+
+        Raises:
+            ValueError: the map has no classes.
+        """
+        return channel_queries.class_log_odds(self, points)
+
+    def class_probability(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (..., K) probability of each class, given a surface there.
+
+        It is 1/K far from all occupied clusters.
+
+        Raises:
+            ValueError: the map has no classes.
+        """
+        return torch.softmax(self.class_log_odds(points), dim=-1)
+
+    def class_posterior(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (..., K + 1) distribution: free, or occupied by each class.
+
+        Raises:
+            ValueError: the map has no classes.
+        """
+        occupied = self._query(points, probability=True)[..., None]
+        return torch.cat([1 - occupied, occupied * self.class_probability(points)], dim=-1)
+
+    @property
+    def classes(self) -> list[int]:
+        """Class numbers, in the order of the columns of `class_log_odds`; empty without classes."""
+        return list(self.channel_layout.get(CLASS, ()))
+
+    @torch.no_grad()
+    def unknown(self, points: TensorLike) -> Tensor:
+        """(..., D) world positions [m] -> (...) degree to which space is unobserved, 0 to 1.
+
+        The value is 1 minus the largest feature among clusters of occupied or free points. Where the
+        probability is near 1/2, values near 0 indicate contradictory data, values near 1 no data.
+        """
+        local = self._to_map_frame(points)
+        flat = local.reshape(-1, self.dim)
+        if len(self) == 0:
+            return torch.ones_like(flat[:, 0]).reshape(local.shape[:-1])
+        parts = [flat.new_ones(0)]
+        for chunk in flat.split(posterior.QUERY_CHUNK):
+            indices, values = self._nearest_features(chunk)
+            seen = torch.where(self.counts[indices] > 0, values, 0 * values)  # NaN stays NaN
+            parts.append(1 - seen.amax(dim=1))
+        return self._as_answer(torch.cat(parts)).reshape(local.shape[:-1])
+
+    @torch.no_grad()
+    def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
+        """Probability or log-odds at all points of a lattice, faster than one by one.
+
+        Args:
+            axes: D lists of world coordinates [m]; the lattice is their Cartesian product.
+            probability: True: return the probability; False: return the log-odds.
+
+        Returns:
+            (len(axes[0]), len(axes[1]), ...) values without gradient.
+        """
+        check_axes(axes, self.dim)
+        tensors, index = self._tensors(), self._fresh_index()
+        pairs, dtype = zip(axes, self.origin, strict=True), tensors[0].dtype
+        local = [to_map_frame(axis, shift, dtype) for axis, shift in pairs]
+        answer = native.lattice_occupancy(local, *tensors, probability=probability, index=index)
+        return self._as_answer(answer)
+
+    def native_map(self) -> NativeMap | None:
+        """The tensors of the map for the native library; None if it does not support this map."""
+        if len(self) == 0 or not native.supports(self.centers):
+            return None
+        tensors = (self.centers.detach(), self.raw_scale_tril.detach(), self.weights.detach())
+        return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
+
+    @torch.no_grad()
+    def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
+        """`raycasting.raycast` in the native library; None if it does not support this map.
+
+        Args:
+            origins: (R, D) world positions, float64 [m].
+            directions: (R, D) unit vectors, float64.
+            march: parameters of `native.raycast`.
+        """
+        found = self.native_map()
+        if found is None:
+            return None
+        rays = (origins - self.origin, directions)
+        return native.raycast(rays, march, found[:3], found.kernel, found.center_index)
+
+    def _query(self, points: TensorLike, probability: bool) -> Tensor:
+        local = self._to_map_frame(points)
+        flat, index = local.reshape(-1, self.dim), self._fresh_index()
+        answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
+        return self._as_answer(answer).reshape(local.shape[:-1])
+
+    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
+        centers, raw = at_least_float32(self.centers), at_least_float32(self.raw_scale_tril)
+        return centers, raw, at_least_float32(self.weights), self.kernel
+
+    def _as_answer(self, values: Tensor) -> Tensor:
+        return values.to(self.centers.dtype)
+
+    def _posterior(self, points: TensorLike) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the log-odds at (..., D) points."""
+        if not bool((self.posterior_variances > 0).all()) or len(self) == 0:
+            raise RuntimeError(
+                "variance needs the posterior of every weight; "
+                "call fit_uncertainty(points, labels) first, and again after update"
+            )
+        local = self._to_map_frame(points)
+        own = (self.posterior_means, self.posterior_variances, self.posterior_scales)
+        flat = local.reshape(-1, self.dim)
+        answer = posterior.predict(self._nearest_features, flat, posterior.Posterior(*own))
+        mean, variance = (values.reshape(local.shape[:-1]) for values in answer)
+        return mean, variance
+
+    def _nearest_features(self, local: Tensor) -> tuple[Tensor, Tensor]:
+        centers, raw, *_ = self._tensors()
+        index = self._fresh_index()
+        return native.nearest_features(local, centers.detach(), raw.detach(), self.kernel, index)
+
+    def _fresh_index(self) -> Tensor:
+        """Index of the neighbor search. It is rebuilt if the centers have changed."""
+        # The operators check the index themselves; the transforms of torch.func do not use it.
+        if torch.compiler.is_compiling() or native.transformed():
+            return self._index
+        centers = at_least_float32(self.centers)
+        known = native.index_matches(self._index, centers, self.num_neighbors)
+        if not known or self._index.is_inference():
+            with normal_tensors():
+                self._index = native.build_index(centers, self.num_neighbors)
+        return self._index
+
+    def _to_map_frame(self, points: TensorLike) -> Tensor:
+        points = as_tensor(points, "points", self.origin.device)
+        check_points(points, self.dim)
+        dtype = torch.promote_types(self.centers.dtype, torch.float32)
+        return to_map_frame(points, self.origin, dtype)
