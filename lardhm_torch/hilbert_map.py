@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
+from lardhm_torch import native, packing
 from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import map_merging, parameters, posterior
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
+from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.native.surfaces import NativeMap
@@ -240,6 +241,7 @@ class LardHilbertMap(parameters.MapParameters):
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
+        self.check_learns()
         samples = training_points(points, labels, self.centers)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "fit", self.centers.device)
@@ -266,6 +268,7 @@ class LardHilbertMap(parameters.MapParameters):
         Raises:
             ValueError: the map is empty, or the samples are invalid (see `fit`).
         """
+        self.check_learns()
         if len(self) == 0:
             raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
         local, labels, _ = training_points(points, labels, self.centers, self.origin)
@@ -307,6 +310,7 @@ class LardHilbertMap(parameters.MapParameters):
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
+        self.check_learns()
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
@@ -336,10 +340,8 @@ class LardHilbertMap(parameters.MapParameters):
             ValueError: wrong shapes, or rotation is not a rotation.
         """
         state = parameters.read_state(self)
-        kept = self._copied_posterior(slice(None))
-        parameters.write_state(self, *map_merging.moved(state, self.origin, rotation, translation))
-        self.posterior_means, self.posterior_variances, self.posterior_scales = kept
-        return self
+        moved = map_merging.moved(state, self.origin, rotation, translation)
+        return self._rewrite(*moved, slice(None))
 
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
@@ -356,15 +358,15 @@ class LardHilbertMap(parameters.MapParameters):
         center = map_merging.check_sphere(center, radius, self.origin)
         state = parameters.read_state(self)
         rows = map_merging.within(state, center - self.origin, radius, self.kernel)
-        kept = self._copied_posterior(rows)
-        parameters.write_state(self, state.rows(rows), self.origin)
+        return self._rewrite(state.rows(rows), self.origin, rows)
+
+    def _rewrite(self, state: MapState, origin: Tensor, rows: Tensor | slice) -> LardHilbertMap:
+        """Replace the clusters by ``rows``, moved; these keep their features and posterior."""
+        columns = (self.posterior_means[rows], self.posterior_variances[rows])
+        kept = (*(column.clone() for column in columns), self.posterior_scales.clone())
+        parameters.write_state(self, state, origin)
         self.posterior_means, self.posterior_variances, self.posterior_scales = kept
         return self
-
-    def _copied_posterior(self, rows: Tensor | slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Posterior of some weights, which stays valid where these keep their features."""
-        means, variances = self.posterior_means[rows], self.posterior_variances[rows]
-        return means.clone(), variances.clone(), self.posterior_scales.clone()
 
     # --- files ---
 
@@ -373,28 +375,33 @@ class LardHilbertMap(parameters.MapParameters):
 
         Args:
             path: file; the extension ``.safetensors`` selects that format.
-            evidence: write the points kept by the clusters, too. Without them, the file is about a
-                quarter as large, and a later `update` continues with points drawn from the moments of
-                the clusters.
+            evidence: write the points kept by the clusters, too. Without them the file is about a
+                quarter as large, and a later `update` draws points from the clusters' moments.
         """
         state = self.state_dict()
         if not evidence:
             state = {name: value for name, value in state.items() if name not in parameters.HISTORY}
         map_files.save_state(state, path)
 
+    def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:
+        """Write a small file, about 12 bytes per cluster in 3-D, of a map that answers but cannot learn.
+
+        Args:
+            path: file, usually ``.lhm``.
+            precision: fractional bits of the rounded parameters, 1 to 16 (docs/map_format.md).
+        """
+        packing.save_packed(self, path, precision)
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:
-        """Read a map file written by `save` or by `torch.save(model.state_dict(), ...)`.
+        """Read a map file written by `save`, `pack` or `torch.save(model.state_dict(), ...)`.
 
         Raises:
             FileNotFoundError: the file does not exist.
             ValueError: the file is not a map, is damaged or unsafe, or has a newer format.
         """
-        state = map_files.load_state(path)
+        state = packing.load_state(path)
         try:
-            settings = map_files.map_settings(state)
-            model = cls(**settings, dtype=state["centers"].dtype)
-            model.load_state_dict(state)
+            return cls.from_state(state)
         except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:
             raise ValueError(f"{os.fspath(path)} must hold a LardHilbertMap; {error}") from error
-        return model

@@ -36,8 +36,9 @@ def sections_missing(function):
 
 def test_the_fixed_names_are_public():
     fixed = """
-        Body FitConfig LardHilbertMap MapViewer Mover Samples SamplingConfig ScanReport Scans
-        StreamConfig TiledMap TuneConfig UpdateConfig body_collision_probability body_distance
+        Body FitConfig LardHilbertMap MapViewer Mover PacketReceiver PacketSender PacketWriter
+        Samples SamplingConfig ScanReport Scans StreamConfig
+        TiledMap TuneConfig UpdateConfig body_collision_probability body_distance
         capsule_distance clearance collision_probability evaluate expected_range extract_mesh
         fine_tune free_probability frontiers grid information_gain iter_scans load_points load_scans
         merge_maps query_grid query_slice raycast real_time resize_optimizer resume_stream

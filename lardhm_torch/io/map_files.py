@@ -100,6 +100,7 @@ def check_settings(extra: Any) -> dict[str, Any]:
         )
     settings = dict(extra)
     version = settings.pop("format_version")
+    settings.pop("is_packed", None)
     if version != FORMAT_VERSION:
         cure = (
             "A newer map needs a newer lardhm_torch"

@@ -71,6 +71,7 @@ def fine_tune(
             `fit`), or the state belongs to a different map or config.
     """
     config = config or TuneConfig()
+    model.check_learns()
     if len(model) == 0:
         raise ValueError("model must be fitted before it is tuned; it is empty. Call fit first")
     if not (config.tune_weights or config.tune_centers or config.tune_scales):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,7 @@ from lardhm_torch.learning.map_state import EVIDENCE, MapState, no_evidence
 
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
 HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
+AnyMap = TypeVar("AnyMap", bound="MapParameters")
 SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
 
 
@@ -56,6 +57,7 @@ class MapParameters(nn.Module):
         self.num_neighbors = num_neighbors
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
+        self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
         self._register_empty(dim, device, dtype)
         self._index = torch.empty(0, dtype=torch.uint8)
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
@@ -92,6 +94,13 @@ class MapParameters(nn.Module):
         }
         for name, tensor in buffers.items():
             self.register_buffer(name, tensor)
+
+    @classmethod
+    def from_state(cls: type[AnyMap], state: dict[str, Any]) -> AnyMap:
+        """A map with the settings and tensors of a state dict."""
+        model = cls(**map_files.map_settings(state), dtype=state["centers"].dtype)
+        model.load_state_dict(state)
+        return model
 
     def __len__(self) -> int:
         """Number of clusters M."""
@@ -143,10 +152,20 @@ class MapParameters(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Format version and settings, stored in the state dict with the tensors."""
-        return {"format_version": map_files.FORMAT_VERSION, **self.settings}
+        packed = {"is_packed": True} if self.is_packed else {}
+        return {"format_version": map_files.FORMAT_VERSION, **self.settings, **packed}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Do nothing: `make_room` has already checked that the settings agree."""
+        """Whether the map is packed; `make_room` has already checked that the settings agree."""
+        self.is_packed = bool(state.get("is_packed", False))
+
+    def check_learns(self) -> None:
+        """Raise a ValueError if the map is packed: it has lost what learning continues from."""
+        if self.is_packed:
+            raise ValueError(
+                "model must hold what it learned from; a packed map answers but does not learn. "
+                "Load the file written by save, or make a new map"
+            )
 
     def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
         """Cast all tensors except the origin, which remains float64 (`.to()`, `.float()`, ...)."""
