@@ -68,8 +68,10 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
 
     if arguments.resume or arguments.view or arguments.radius is not None:
         raise ValueError("--resume, --view and --radius need --incremental")
-    if arguments.send is not None:
-        raise ValueError("--send needs --incremental; `lardhm pack` packs a finished map")
+    if arguments.send is not None or arguments.precision is not None:
+        raise ValueError(
+            "--send and --precision need --incremental; `lardhm pack` packs a finished map"
+        )
     state = _tune_state(arguments.tune_state)
     scans = read_scans(arguments)
     samples = sample_rays(scans, sampling_of(arguments), seed=arguments.seed)

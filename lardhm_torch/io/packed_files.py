@@ -115,6 +115,8 @@ def decode(packet: bytes, base: tuple[int, Packed] | None = None) -> tuple[int, 
         before = _base_table(number, base, (origin.tolist(), precision, neighbors, scale, floor))
         if _checksum(before) != check_before:
             raise ValueError("packet must follow the map it was made from; it is of another stream")
+    if count > len(before) + num_rows:
+        raise ValueError(f"packet must hold all new rows of {count} clusters; it is too short")
     table = _patched(before, columns, count)
     if _checksum(table) != check:
         raise ValueError("the checksum of the map differs after this packet: it is damaged")
