@@ -32,7 +32,7 @@ FLAGS = (
 # Sources that are compiled together, the longest job first. Torch's headers take a second a unit: the
 # last two do without.
 UNITS = (
-    ("query", "kmeans", "gradients", "descent"),
+    ("query", "kmeans", "gradients", "descent", "tuning"),
     ("raycast", "update", "pooling", "evidence", "cells", "marching", "ridge", "threads"),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
