@@ -100,11 +100,11 @@ def grid(arguments: argparse.Namespace) -> None:
 
 def pack(arguments: argparse.Namespace) -> None:
     """Write a small file of a map, to be sent: it answers queries, but does not learn."""
-    from lardhm_torch import maps
-    from lardhm_torch.tiles.tiled_map import open_map
+    from lardhm_torch.tiles.tiled_map import TiledMap, open_map
 
     check_output(arguments.output, (".lhm",), [arguments.map])
-    model = maps.in_memory(open_map(arguments.map))
+    opened = open_map(arguments.map)
+    model = opened.merge() if isinstance(opened, TiledMap) else opened
     settings = {} if arguments.precision is None else {"precision": arguments.precision}
     model.pack(arguments.output, **settings)
     size = Path(arguments.output).stat().st_size

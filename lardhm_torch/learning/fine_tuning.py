@@ -170,8 +170,8 @@ class TuneConfig:
     ``l2`` and ``stiffness`` are relative to the summed loss of all points.
     """
 
-    epochs: int = 12
-    passes: int = 1  # over the samples of an epoch, with the same neighbors
+    epochs: int = 4  # with new neighbors, and new samples where they are drawn anew
+    passes: int = 3  # over the samples of an epoch
     batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
     center_rate: float = 0.02  # per step, relative to the mean length-scale of the cluster
@@ -274,10 +274,10 @@ class TuningRun:
         plan = Plan(count, -(-count // steps), total)
         factors = balance_classes(samples.labels, config.occupied_share)
         columns = (samples.positions, samples.labels, factors, self._neighbors(samples.positions))
-        *columns, near = stratified_batches(columns, plan.batch_size, self.rng)
+        *batches, near = stratified_batches(columns, plan.batch_size, self.rng)
         for _ in range(config.passes):
             self.moving = tuning_steps(
-                Batches(*columns), near, self.table, self.moving, self.step, plan
+                Batches(*batches), near, self.table, self.moving, self.step, plan
             )
             self.step += steps
         self.epoch += 1
