@@ -159,6 +159,16 @@ def test_a_state_of_another_map_or_config_is_refused():
         fine_tune(other, points, labels, config=config, state=states[0])
 
 
+def test_many_points_are_tuned_in_groups(monkeypatch):
+    model, points, labels = fitted(num_clusters=8, config=FitConfig(passes=4))
+    apart, states = copy.deepcopy(model), []
+    at_once = fine_tune(model, points, labels)
+    monkeypatch.setattr("lardhm_torch.learning.fine_tuning.GROUP_ROWS", 1500)
+    in_groups = fine_tune(apart, points, labels, after_epoch=states.append)
+    assert states[-1]["step"] == 4 * 3 * 6  # three groups of two batches
+    assert in_groups[-1] == pytest.approx(at_once[-1], rel=0.2)
+
+
 def test_a_failure_leaves_the_map_as_it_was(monkeypatch):
     model, points, labels = fitted()
     before = model.centers.clone()

@@ -29,7 +29,8 @@ from lardhm_torch.learning.tuning_steps import (
 from lardhm_torch.points import UNKNOWN, as_tensor, check_samples, in_morton_order, to_map_frame
 from lardhm_torch.sampling import Samples, seeded_generator
 
-MAX_BATCH = 1 << 15  # upper bound on the default batch size, to limit memory
+MAX_BATCH = 1 << 15  # upper bound on the default batch size
+GROUP_ROWS = 1 << 21  # number of points whose neighbors are in memory at a time
 State = dict[str, Any]  # tensors and plain values, for `torch.save` and `torch.load`
 EVALUATION_POINTS = 1 << 16  # number of points used to evaluate the loss after each epoch
 
@@ -52,10 +53,11 @@ def fine_tune(
     The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
     of centers are in units of the mean length-scale of their cluster, and the diagonals of factors
     are optimized as logarithms. Learning rates are therefore independent of the scene, and every
-    factor remains valid. Neighbors are searched once per epoch. With ``hold_out``, a fraction of the
-    rays is excluded from training, and the parameters of the epoch with the smallest loss on them
-    are kept. The initial map is not a candidate, because `fit` has used those rays. If anything
-    fails, the map is unchanged.
+    factor remains valid. In each epoch the neighbors are searched once and the points passed several
+    times, in groups, so that memory for neighbors does not grow with the number of points. With
+    ``hold_out``, a fraction of the rays is excluded from training, and the parameters of the epoch
+    with the smallest loss on them are kept. The initial map is not a candidate, because `fit` has
+    used those rays. If anything fails, the map is unchanged.
 
     Args:
         model: a fitted map, changed in place.
@@ -268,18 +270,25 @@ class TuningRun:
     def train(self, samples: LabelledPoints) -> None:
         """Train for one epoch over the points, and keep the parameters if they are the best."""
         config, count = self.config, len(samples.labels)
+        groups = -(-count // GROUP_ROWS)
         wanted = config.batch_size or min(MAX_BATCH, max(1024, count // 64))
-        steps = -(-count // wanted)
-        total = self.step + (config.epochs - self.epoch) * config.passes * steps
-        plan = Plan(count, -(-count // steps), total)
+        batch_size = -(-count // (groups * -(-count // (groups * wanted))))
+        steps = [-(-len(range(group, count, groups)) // batch_size) for group in range(groups)]
+        total = self.step + (config.epochs - self.epoch) * config.passes * sum(steps)
+        plan = Plan(count, batch_size, total)
         factors = balance_classes(samples.labels, config.occupied_share)
-        columns = (samples.positions, samples.labels, factors, self._neighbors(samples.positions))
-        *batches, near = stratified_batches(columns, plan.batch_size, self.rng)
-        for _ in range(config.passes):
-            self.moving = tuning_steps(
-                Batches(*batches), near, self.table, self.moving, self.step, plan
+        for group, steps_per_pass in enumerate(steps):
+            columns = (samples.positions, samples.labels, factors)
+            points, labels, weights = (column[group::groups].contiguous() for column in columns)
+            near = self._neighbors(points)
+            *batches, near = stratified_batches(
+                (points, labels, weights, near), batch_size, self.rng
             )
-            self.step += steps
+            for _ in range(config.passes):
+                self.moving = tuning_steps(
+                    Batches(*batches), near, self.table, self.moving, self.step, plan
+                )
+                self.step += steps_per_pass
         self.epoch += 1
         self._keep_best(self.evaluate())
 
