@@ -17,6 +17,8 @@ _PROBED_BYTES = 3360 * 4  # a whole number of points in every layout
 _LEAST_POINTS = 30  # with fewer, the number of columns cannot be recognized
 _CLEARLY = 0.3  # in mean log variance: another number of columns must fit KITTI's better by this
 _MULTIPLE = 1.0  # the same for twice as many columns, which always fit a little better
+_FIRST_BYTES = 120 * 16  # points of KITTI's that are looked at first
+_FAR = 1e9  # [m] beyond all coordinates
 _SIGN, _EXPONENT = np.uint32(1 << 31), np.uint32(0xFF << 23)  # bits of a float32
 # Exponents of coordinates, intensities and times are between 2^-40 and 2^63.
 _TINY, _HUGE = np.uint32((127 - 40) << 23), np.uint32((127 + 63) << 23)
@@ -36,6 +38,8 @@ def find_layout(content: NDArray[np.uint8], is_nuscenes: bool = False) -> Layout
         ValueError: no layout fits, or several do.
     """
     probe = content[:_PROBED_BYTES]
+    if len(content) % 16 == 0 and _is_clearly_kitti(probe[:_FIRST_BYTES]):
+        return KITTI
     words = probe[: len(probe) // 8 * 8].view("<u4")
     exponents = words & _EXPONENT
     is_huge = exponents > _HUGE
@@ -55,6 +59,21 @@ def find_layout(content: NDArray[np.uint8], is_nuscenes: bool = False) -> Layout
             f"got {len(content)} bytes of another layout. Convert the file to .npz, .pcd or .csv"
         )
     return layout
+
+
+def _is_clearly_kitti(first: NDArray[np.uint8]) -> bool:
+    """Whether every fourth float is a reflectance from 0 to 1, and each coordinate leaves that range.
+
+    Quick, and true of no other layout: with a number of columns that is no multiple of 4, every fourth
+    float would be a coordinate now and then; with 8, one of the first seven columns would be in the
+    range, too; and halves of doubles have wild exponents.
+    """
+    if len(first) < _FIRST_BYTES:
+        return False
+    values = first.view("<f4").reshape(-1, 8)
+    low, high = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+    is_reflectance = all(low[n] >= 0 and high[n] <= 1 for n in (3, 7))
+    return is_reflectance and all(1 < max(high[n], -low[n]) < _FAR for n in (0, 1, 2, 4, 5, 6))
 
 
 def _layout_of(

@@ -102,7 +102,7 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
         raise ValueError(
             f'poses_frame must be "camera" or "lidar" beside {source}; got {poses_frame!r}'
         )
-    folders = tuple(map(_changed, (*places, _folders_of(source)[1])))
+    folders = tuple(map(_changed, dict.fromkeys((*places, _folders_of(source)[1]))))
     files = (source, *_calibrations(places[0], source, folders))
     stamps = (*folders, *map(_changed, files))
     suffix = path.suffix.lower()
