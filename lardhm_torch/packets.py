@@ -49,11 +49,7 @@ class PacketSender:
 
 
 class PacketReceiver:
-    """Holds the map of the packets that were applied.
-
-    Attributes:
-        number: number of the last packet, -1 before the first.
-    """
+    """Holds the map of the packets that were applied."""
 
     def __init__(self) -> None:
         self._last: tuple[int, packed_files.Packed] | None = None
