@@ -4,7 +4,7 @@
 # make test   run linter, type checker and tests
 # make docs   build the documentation (out/docs/index.html); warnings are errors
 # make bench  run the benchmarks (minutes)
-# make soak   run the long tests: fuzzing, flipped bits, kills (tens of minutes)
+# make soak   run the long tests: fuzzing, flipped bits, kills, full disks (tens of minutes)
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -44,4 +44,5 @@ soak: .venv/ready
 	$(BIN)/python scripts/fuzz_readers.py
 	$(BIN)/python scripts/soak_bits.py --flips 1000 --seed 0
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0
-	$(BIN)/python scripts/soak_tiles.py --kills 20 --seed 0
+	$(BIN)/python scripts/soak_tiles.py --kills 50 --seed 0
+	$(BIN)/python scripts/soak_saves.py --kills 50 --seed 0

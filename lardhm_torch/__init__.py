@@ -99,6 +99,9 @@ _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names
 __all__ = sorted(_MODULE_OF)
 
 
+importlib.import_module(f"{__name__}.operator_import").define_operators()
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name on first use, which keeps `import lardhm_torch` fast."""
     if name not in _MODULE_OF:

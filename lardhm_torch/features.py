@@ -7,7 +7,7 @@ values faster.
 from __future__ import annotations
 
 import importlib.util
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -107,6 +107,22 @@ def _plain_nearest(points: Tensor, centers: Tensor, num_neighbors: int) -> Tenso
 def _(points: Tensor, centers: Tensor, num_neighbors: int) -> Tensor:
     k = min(num_neighbors, centers.shape[0])
     return points.new_empty((points.shape[0], k), dtype=torch.long)
+
+
+@_plain_nearest.register_vmap
+def _(
+    info: Any, in_dims: tuple[int | None, ...], points: Tensor, centers: Tensor, num_neighbors: int
+) -> tuple[Tensor, int]:
+    """Batches of points are searched together; batches of centers, as of several maps, in turn."""
+    if in_dims[0] is not None:
+        points = points.movedim(in_dims[0], 0)
+    if in_dims[1] is None:
+        flat = nearest_centers(points.flatten(0, 1), centers, num_neighbors)
+        return flat.unflatten(0, points.shape[:2]), 0
+    maps = centers.movedim(in_dims[1], 0)
+    batches = [points] * len(maps) if in_dims[0] is None else points
+    found = [nearest_centers(*pair, num_neighbors) for pair in zip(batches, maps, strict=True)]
+    return torch.stack(found), 0
 
 
 def _kdtree_candidates(points: Tensor, centers: Tensor, count: int) -> Tensor:

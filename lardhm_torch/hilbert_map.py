@@ -13,9 +13,10 @@ from lardhm_torch import native, packing
 from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import map_merging, parameters, posterior
+from lardhm_torch.learning.changes import changes_map, normal_tensors
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
-from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.parameters import at_least_float32
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.native.surfaces import NativeMap
@@ -28,7 +29,8 @@ class LardHilbertMap(parameters.MapParameters):
 
     The probability is exactly 1/2 in an empty map and far from all clusters. Points are
     given in the world frame; ``origin`` is subtracted in float64 before they are cast to the map's
-    dtype, so coordinates may be far from zero. A point with a NaN or infinite coordinate has
+    dtype, so coordinates may be far from zero. Maps of half precision answer in their dtype and compute
+    in float32; they cannot be trained. A point with a NaN or infinite coordinate has
     probability NaN. Tensors, NumPy arrays and lists are accepted as points.
 
     Args:
@@ -72,12 +74,11 @@ class LardHilbertMap(parameters.MapParameters):
         local = self._to_map_frame(points)
         if local.ndim != 2:
             raise ValueError(f"points must be (N, {self.dim}); got {tuple(local.shape)}")
-        indices = native.nearest_centers(
-            local, self.centers, self.num_neighbors, self._fresh_index()
-        )
-        values = lard_kernel(local, self.centers, self.scale_tril, indices)
-        values = values * neighbor_fade(local, self.centers, indices)
-        return feature_matrix(indices, values, len(self))
+        centers = at_least_float32(self.centers)
+        indices = native.nearest_centers(local, centers, self.num_neighbors, self._fresh_index())
+        values = lard_kernel(local, centers, self.scale_tril, indices)
+        values = values * neighbor_fade(local, centers, indices)
+        return feature_matrix(indices, self._as_answer(values), len(self))
 
     def variance(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) variance of the log-odds.
@@ -87,7 +88,7 @@ class LardHilbertMap(parameters.MapParameters):
         Raises:
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
-        return self._posterior(points)[1]
+        return self._as_answer(self._posterior(points)[1])
 
     def bayesian_probability(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
@@ -96,7 +97,7 @@ class LardHilbertMap(parameters.MapParameters):
             RuntimeError: `fit_uncertainty` was not called since the clusters changed.
         """
         mean, variance = self._posterior(points)
-        return posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance)
+        return self._as_answer(posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance))
 
     @torch.no_grad()
     def unknown(self, points: TensorLike) -> Tensor:
@@ -114,11 +115,11 @@ class LardHilbertMap(parameters.MapParameters):
             indices, values = self._nearest_features(chunk)
             seen = torch.where(self.counts[indices] > 0, values, 0 * values)  # NaN stays NaN
             parts.append(1 - seen.amax(dim=1))
-        return torch.cat(parts).reshape(local.shape[:-1])
+        return self._as_answer(torch.cat(parts)).reshape(local.shape[:-1])
 
     @torch.no_grad()
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """Probability or log-odds at all points of a lattice. Faster than querying the points.
+        """Probability or log-odds at all points of a lattice, faster than one by one.
 
         Args:
             axes: D lists of world coordinates [m]; the lattice is their Cartesian product.
@@ -126,18 +127,13 @@ class LardHilbertMap(parameters.MapParameters):
 
         Returns:
             (len(axes[0]), len(axes[1]), ...) values without gradient.
-
-        Raises:
-            ValueError: axes are not D lists of finite coordinates.
         """
         check_axes(axes, self.dim)
-        local = [
-            to_map_frame(axis, shift, self.centers.dtype)
-            for axis, shift in zip(axes, self.origin, strict=True)
-        ]
-        return native.lattice_occupancy(
-            local, *self._tensors(), probability=probability, index=self._fresh_index()
-        )
+        tensors, index = self._tensors(), self._fresh_index()
+        pairs, dtype = zip(axes, self.origin, strict=True), tensors[0].dtype
+        local = [to_map_frame(axis, shift, dtype) for axis, shift in pairs]
+        answer = native.lattice_occupancy(local, *tensors, probability=probability, index=index)
+        return self._as_answer(answer)
 
     def native_map(self) -> NativeMap | None:
         """The tensors of the map for the native library; None if it does not support this map."""
@@ -165,10 +161,14 @@ class LardHilbertMap(parameters.MapParameters):
         local = self._to_map_frame(points)
         flat, index = local.reshape(-1, self.dim), self._fresh_index()
         answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
-        return answer.reshape(local.shape[:-1])
+        return self._as_answer(answer).reshape(local.shape[:-1])
 
     def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
-        return self.centers, self.raw_scale_tril, self.weights, self.kernel
+        centers, raw = at_least_float32(self.centers), at_least_float32(self.raw_scale_tril)
+        return centers, raw, at_least_float32(self.weights), self.kernel
+
+    def _as_answer(self, values: Tensor) -> Tensor:
+        return values.to(self.centers.dtype)
 
     def _posterior(self, points: TensorLike) -> tuple[Tensor, Tensor]:
         """Mean and variance of the log-odds at (..., D) points."""
@@ -179,34 +179,37 @@ class LardHilbertMap(parameters.MapParameters):
             )
         local = self._to_map_frame(points)
         own = (self.posterior_means, self.posterior_variances, self.posterior_scales)
-        answer = posterior.predict(
-            self._nearest_features, local.reshape(-1, self.dim), posterior.Posterior(*own)
-        )
+        flat = local.reshape(-1, self.dim)
+        answer = posterior.predict(self._nearest_features, flat, posterior.Posterior(*own))
         mean, variance = (values.reshape(local.shape[:-1]) for values in answer)
         return mean, variance
 
     def _nearest_features(self, local: Tensor) -> tuple[Tensor, Tensor]:
-        centers, raw_scale_tril = self.centers.detach(), self.raw_scale_tril.detach()
-        return native.nearest_features(
-            local, centers, raw_scale_tril, self.kernel, self._fresh_index()
-        )
+        centers, raw, *_ = self._tensors()
+        index = self._fresh_index()
+        return native.nearest_features(local, centers.detach(), raw.detach(), self.kernel, index)
 
     def _fresh_index(self) -> Tensor:
         """Index of the neighbor search. It is rebuilt if the centers have changed."""
-        if torch.compiler.is_compiling():  # the operators check the index themselves
+        # The operators check the index themselves; the transforms of torch.func do not use it.
+        if torch.compiler.is_compiling() or native.transformed():
             return self._index
-        if not native.index_matches(self._index, self.centers, self.num_neighbors):
-            with torch.inference_mode(False):  # inference tensors cannot be used in training
-                self._index = native.build_index(self.centers, self.num_neighbors)
+        centers = at_least_float32(self.centers)
+        known = native.index_matches(self._index, centers, self.num_neighbors)
+        if not known or self._index.is_inference():
+            with normal_tensors():
+                self._index = native.build_index(centers, self.num_neighbors)
         return self._index
 
     def _to_map_frame(self, points: TensorLike) -> Tensor:
         points = as_tensor(points, "points", self.origin.device)
         check_points(points, self.dim)
-        return to_map_frame(points, self.origin, self.centers.dtype)
+        dtype = torch.promote_types(self.centers.dtype, torch.float32)
+        return to_map_frame(points, self.origin, dtype)
 
     # --- learning ---
 
+    @changes_map
     def fit(
         self,
         points: TensorLike,
@@ -250,6 +253,7 @@ class LardHilbertMap(parameters.MapParameters):
         parameters.write_state(self, state, samples.origin)
         return self
 
+    @changes_map
     @torch.no_grad()
     def fit_uncertainty(self, points: TensorLike, labels: TensorLike) -> LardHilbertMap:
         """Estimate the variance of the weights, for `variance` and `bayesian_probability`.
@@ -276,6 +280,7 @@ class LardHilbertMap(parameters.MapParameters):
         self.posterior_means, self.posterior_variances, self.posterior_scales = found
         return self
 
+    @changes_map
     def update(
         self,
         points: TensorLike,
@@ -323,6 +328,7 @@ class LardHilbertMap(parameters.MapParameters):
         parameters.write_rows(self, *changes)
         return self
 
+    @changes_map
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
         """Apply the rigid transform x -> rotation x + translation to the map.
 
@@ -340,9 +346,11 @@ class LardHilbertMap(parameters.MapParameters):
             ValueError: wrong shapes, or rotation is not a rotation.
         """
         state = parameters.read_state(self)
-        moved = map_merging.moved(state, self.origin, rotation, translation)
-        return self._rewrite(*moved, slice(None))
+        state, origin = map_merging.moved(state, self.origin, rotation, translation)
+        map_merging.replace_clusters(self, state, origin, slice(None))
+        return self
 
+    @changes_map
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
@@ -358,14 +366,7 @@ class LardHilbertMap(parameters.MapParameters):
         center = map_merging.check_sphere(center, radius, self.origin)
         state = parameters.read_state(self)
         rows = map_merging.within(state, center - self.origin, radius, self.kernel)
-        return self._rewrite(state.rows(rows), self.origin, rows)
-
-    def _rewrite(self, state: MapState, origin: Tensor, rows: Tensor | slice) -> LardHilbertMap:
-        """Replace the clusters by ``rows``, moved; these keep their features and posterior."""
-        columns = (self.posterior_means[rows], self.posterior_variances[rows])
-        kept = (*(column.clone() for column in columns), self.posterior_scales.clone())
-        parameters.write_state(self, state, origin)
-        self.posterior_means, self.posterior_variances, self.posterior_scales = kept
+        map_merging.replace_clusters(self, state.rows(rows), self.origin, rows)
         return self
 
     # --- files ---
@@ -378,9 +379,8 @@ class LardHilbertMap(parameters.MapParameters):
             evidence: write the points kept by the clusters, too. Without them the file is about a
                 quarter as large, and a later `update` draws points from the clusters' moments.
         """
-        state = self.state_dict()
-        if not evidence:
-            state = {name: value for name, value in state.items() if name not in parameters.HISTORY}
+        left_out = () if evidence else parameters.HISTORY
+        state = {name: value for name, value in self.state_dict().items() if name not in left_out}
         map_files.save_state(state, path)
 
     def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:

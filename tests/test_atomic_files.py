@@ -1,4 +1,5 @@
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -110,3 +111,58 @@ def test_the_partial_files_of_a_whole_folder_are_removed(path):
     assert len(list(path.parent.iterdir())) == 4
     remove_partials(path.parent)
     assert {file.name for file in path.parent.iterdir()} == {"map.pt", "folder"}
+
+
+def test_the_next_writer_removes_what_killed_ones_left(path):
+    for _ in range(3):
+        kill_writer(path)
+        assert len(list(path.parent.iterdir())) == 2  # nothing piles up
+    with replaced_file(path) as partial:
+        partial.write_bytes(b"new")
+    assert path.read_bytes() == b"new"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_the_file_of_a_living_writer_is_left_alone(path):
+    with replaced_file(path) as first:
+        first.write_bytes(b"first")
+        remove_partials(path)
+        remove_partials(path.parent)
+        with replaced_file(path) as second:
+            second.write_bytes(b"second")
+        assert path.read_bytes() == b"second"
+    assert path.read_bytes() == b"first"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(path, tmp_path):
+    other = tmp_path / "other.txt"
+    other.write_bytes(b"precious")
+    with replaced_file(path) as partial:
+        pass
+    partial.symlink_to(other)
+    with replaced_file(path) as again:
+        assert again != partial
+        again.write_bytes(b"new")
+    assert (other.read_bytes(), path.read_bytes()) == (b"precious", b"new")
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(28, "No space left on device"), PermissionError(13, "Permission denied")]
+)
+def test_an_error_of_the_system_names_the_file(path, error):
+    with pytest.raises(type(error), match=r"map\.pt'$") as raised, replaced_file(path):
+        raise error
+    assert raised.value.errno == error.errno
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_folder_that_disappears_is_an_error_that_names_the_file(path):
+    with pytest.raises(FileNotFoundError, match=r"map\.pt'$"), replaced_file(path):
+        shutil.rmtree(path.parent)
+
+
+def test_an_error_of_another_file_keeps_its_name(path):
+    with pytest.raises(FileNotFoundError, match="scans"), replaced_file(path):
+        os.stat("scans")

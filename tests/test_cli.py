@@ -1,5 +1,6 @@
 import argparse
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -410,6 +411,30 @@ def test_a_link_to_an_input_is_an_input(bad, monkeypatch, capsys):
     error = fails(capsys, "split", "scans.npz", "-o", "a.npz", "link.npz")
     assert "must not overwrite an input" in error
     (bad / "link.npz").unlink()
+
+
+@pytest.mark.parametrize(
+    ("command", "link"),
+    [
+        ("split scans.npz -o a.npz hard.npz", "scans.npz"),
+        ("query map.pt points.npy -o ./drive/../points.npy", None),
+        ("split drive -o drive/deep/hard.npz a.npz", "drive/0.npz"),
+        ("fit scans.npz -o o.pt --tune-state hard.pt", None),
+    ],
+)
+def test_other_names_of_an_input_are_that_input(bad, monkeypatch, capsys, command, link, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(bad, folder)
+    monkeypatch.chdir(folder)
+    (folder / "drive" / "deep").mkdir()
+    for name in (word for word in command.split() if "hard" in word and link):
+        os.link(link, name)
+    if "--tune-state" in command:  # an output that is linked to the checkpoint
+        (folder / "o.pt").write_bytes(b"old")
+        os.link("o.pt", "hard.pt")
+    before = contents(folder)
+    assert "must not overwrite an input" in fails(capsys, *command.split())
+    assert contents(folder) == before
 
 
 def test_update_may_replace_its_own_map(bad, monkeypatch, tmp_path):

@@ -1,4 +1,5 @@
 import json
+import math
 import os
 import pickle
 import stat
@@ -67,8 +68,12 @@ def test_a_file_that_holds_something_else_is_named(path, content):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"dim": -1}, {"dim": "3"}, {"colour": 1}, {"num_neighbors": 2.5}, {"dim": 10**9}]
-)
+    "settings",
+    [
+        {"dim": -1}, {"dim": "3"}, {"colour": 1}, {"num_neighbors": 2.5}, {"dim": 10**9},
+        {"num_neighbors": 2**62}, {"covariance_scale": math.inf}, {"min_lengthscale": math.nan},
+    ],
+)  # fmt: skip
 def test_hostile_settings_are_refused(path, settings):
     state = LardHilbertMap().state_dict()
     state["_extra_state"].update(settings)

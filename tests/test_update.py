@@ -18,8 +18,9 @@ from lardhm_torch import (
 )
 from lardhm_torch.learning.clustering import cluster_points
 from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
-from lardhm_torch.learning.forgetting import contradicted, doubted, forget
+from lardhm_torch.learning.forgetting import DOUBT, GONE, OVERRULED, doubted, forget, trust
 from lardhm_torch.learning.map_state import new_rows
+from lardhm_torch.learning.regrouping import Rule, _divide
 
 F64 = torch.float64
 PAPER = UpdateConfig(as_in_paper=True)
@@ -300,18 +301,48 @@ def test_an_obstacle_that_rays_pass_through_fades_within_a_few_scans():
     assert (model(beyond[:600]) > 0.5).double().mean() > 0.9
 
 
-def test_a_contradicted_cluster_forgets_most_of_its_past_and_keeps_its_shape():
+def test_trust_in_a_contradicted_cluster_falls_and_returns_with_a_hit():
+    part = known_wall()
+    doubts = torch.tensor([0.0, DOUBT, 2 * DOUBT])
+    assert torch.equal(trust(doubts), torch.tensor([1.0, 1.0, 2.0**-8]))
+    doubted_part = replace(part, doubts=torch.full_like(part.doubts, 2 * DOUBT))
+    after = forget(doubted_part, part.doubts)
+    assert torch.equal(after.evidence, part.evidence)
+    assert torch.equal(after.fresh, kept_counts(part.evidence).to(after.fresh))
+    again = forget(replace(after, doubts=part.doubts, fresh=part.fresh), after.doubts)
+    assert torch.equal(again.fresh, kept_counts(part.evidence).to(after.fresh))
+    assert torch.equal(forget(part, part.doubts).fresh, part.fresh)
+
+
+def test_clusters_that_stay_in_doubt_and_overruled_unknown_ones_lose_their_points():
+    part = known_wall()
+    gone = replace(part, doubts=torch.where(torch.arange(len(part)) == 0, GONE + 1, 0.0))
+    after = forget(gone, gone.doubts)
+    assert (kept_counts(after.evidence) == 0).tolist() == [True] + [False] * (len(part) - 1)
+    unknown = replace(
+        part,
+        is_occupied=torch.zeros_like(part.is_occupied),
+        counts=torch.zeros_like(part.counts),
+        losses=torch.where(torch.arange(len(part)) == 1, 2 * OVERRULED, 0.0),
+    )
+    left = kept_counts(forget(unknown, unknown.doubts).evidence)
+    assert (left == 0).tolist() == [n == 1 for n in range(len(part))]
+
+
+def known_wall():
     points = wall()[0][:600]
     clusters = cluster_points(points, 4, torch.Generator().manual_seed(0))
     owners = torch.cdist(points, clusters.means).argmin(dim=1)
     evidence = keep_points(points, owners, len(clusters))
-    part = new_rows(clusters, torch.ones(len(clusters), dtype=torch.bool), 0.01, evidence)
-    after = forget(part, torch.arange(len(clusters)) == 0)
-    assert torch.equal(after.counts[1:], part.counts[1:])
-    assert after.counts[0] == (part.counts[0] + 3) // 4
-    assert torch.equal(after.evidence[0, :8], part.evidence[0, :8])
-    assert kept_counts(after.evidence)[0] == 8
-    torch.testing.assert_close(after.clusters.covariances, part.clusters.covariances)
+    return new_rows(clusters, torch.ones(len(clusters), dtype=torch.bool), 0.01, evidence)
+
+
+def test_halves_of_a_cluster_in_doubt_are_in_doubt():
+    part = replace(known_wall(), doubts=torch.full((4,), 2.0), losses=torch.ones(4))
+    rule = Rule(kind=0, limit=8, grows=True, few=False, split_loss=0.01, floor=0.01)
+    state, divided = _divide(part, rule)
+    assert divided.sum() == 8
+    assert torch.equal(state.doubts, torch.full((8,), 2.0))
 
 
 def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
@@ -323,11 +354,11 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
     both, labels = torch.cat([hits, free]), torch.tensor([1.0, 0.0]).repeat_interleave(600)
     passed = forgetting_state(known, both, labels, kernel)
-    assert torch.equal(contradicted(passed), known.is_occupied)
+    assert torch.equal(trust(passed.doubts) < 1, known.is_occupied)
     hit_again = forgetting_state(passed, free, torch.ones(600), kernel)
-    assert not contradicted(hit_again).any()
+    assert (trust(hit_again.doubts) == 1).all()
     nothing_there = forgetting_state(known, hits, torch.zeros(600), kernel)
-    assert not contradicted(nothing_there).any()
+    assert (trust(nothing_there.doubts) == 1).all()
 
 
 def forgetting_state(known, points, labels, kernel):

@@ -56,13 +56,22 @@ def check_folder(path: str | os.PathLike[str], inputs: Iterable[str | os.PathLik
 
 
 def _check_not_an_input(path: Path, inputs: Iterable[str | os.PathLike[str]], option: str) -> None:
-    """Raise a ValueError if a path is one of the inputs, or an existing scan of an input folder.
+    """Raise a ValueError if a path is one of the inputs, or an existing scan in an input folder.
 
-    A command that reads a folder of scans may write a new file into it.
+    A command that reads a folder of scans may write a new file into it. Links, hard links and other
+    spellings of an input are that input.
     """
     target = path.resolve()
     for given in inputs:
         source = Path(given).resolve()
-        is_in_input = source.is_dir() and target.is_file() and target.parent == source
-        if target == source or (is_in_input and target.suffix not in MAP_SUFFIXES):
+        is_in_input = source.is_dir() and target.is_file() and source in target.parents
+        is_scan = is_in_input and target.suffix.lower() not in MAP_SUFFIXES
+        if target == source or is_scan or _is_same_file(target, source):
             raise ValueError(f"{option} must not overwrite an input; got {path}")
+
+
+def _is_same_file(first: Path, second: Path) -> bool:
+    try:
+        return first.samefile(second)
+    except OSError:  # one of them does not exist
+        return False

@@ -7,6 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lardhm_torch.io.atomic_files import replaced_file
+
 BINS = 15
 
 
@@ -72,4 +74,5 @@ def draw_reliability(diagrams: dict[str, Tensor], path: str | Path) -> None:
         axes.plot(predicted.numpy(), observed.numpy(), marker="o", markersize=4)
         axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", title=f"{name}: ECE {error:.3f}")
         axes.set(xlabel="predicted probability", ylabel="observed fraction")
-    figure.savefig(path, dpi=130)
+    with replaced_file(path) as partial:
+        figure.savefig(partial, dpi=130)

@@ -43,7 +43,11 @@ def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
 
     Raises:
         FileNotFoundError: the folder of path does not exist.
+        ValueError: a tensor is on the meta device, and has no values.
     """
+    empty = [name for name, value in state.items() if isinstance(value, Tensor) and value.is_meta]
+    if empty:
+        raise ValueError(f"{empty[0]} must have values to be saved; it is on the meta device")
     with replaced_file(path) as partial:
         if _is_safetensors(path):
             _write_safetensors(state, partial)
@@ -136,6 +140,8 @@ def _write_torch(state: Mapping[str, Any], path: Path) -> None:
     try:
         with open(path, "wb") as file:
             torch.save(compact, file)
+    except RuntimeError as error:  # torch's own after a failed write, as on a full disk
+        raise error.__context__ if isinstance(error.__context__, OSError) else error from None
     finally:
         torch.serialization.set_crc32_options(with_checksums)
 
@@ -153,12 +159,29 @@ def _read_torch(path: Path) -> Any:
         file.seek(0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about pickle protocols; the error is enough
-            return torch.load(file, map_location="cpu", weights_only=True)
+            state = torch.load(file, map_location="cpu", weights_only=True)
+    for name, value in state.items() if isinstance(state, dict) else ():
+        _check_stored(name, value)
+    return state
+
+
+def _check_stored(name: str, value: Any) -> None:
+    """A ValueError for a tensor that is larger than its bytes in the file, and would fill the memory."""
+    if isinstance(value, Tensor) and value.layout == torch.strided and not value.is_meta:
+        stored = value.untyped_storage().nbytes()
+        if value.nbytes > stored:
+            raise ValueError(
+                f"{name} must store all its values; {tuple(value.shape)} need {value.nbytes} bytes, "
+                f"and the file has {stored}"
+            )
 
 
 def _verify_zip(file: BinaryIO) -> None:
     """A ValueError where a checksum differs, or torch would take an entry for an empty folder."""
     with zipfile.ZipFile(file) as archive:
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED:  # a few bytes could fill the memory
+                raise ValueError(f"its entry {entry.filename} must not be compressed")
         damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"the checksum of its entry {damaged} differs: the file is damaged")

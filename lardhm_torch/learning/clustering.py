@@ -217,7 +217,7 @@ def scan_clusters(classes: list[Tensor]) -> list[int]:
     return [min(chosen, limit) for limit in limits]
 
 
-def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
+def choose_num_clusters(points: Tensor, *, fine: bool = False, represented: int = 0) -> int:
     """Number of clusters per class that `fit` uses for these occupied points.
 
     The number is one per `CELLS_PER_CLUSTER` cells that contain points, so it is proportional to the
@@ -230,15 +230,17 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False) -> int:
     Args:
         points: (N, D) positions [m].
         fine: use one cluster per `CELLS_PER_SCAN_CLUSTER` cells instead.
+        represented: number of points that these are a sample of, if they are one.
     """
+    size = max(len(points), represented)
     cells = (points / CELL_EDGE).floor().long()
     strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
     # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
     count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
-    few = min(count, max_singletons(len(points)))
+    few = min(count, max_singletons(size))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
-    finest = max(len(points) // POINTS_PER_CLUSTER, few)
-    coarsest = len(points) // DENSE_POINTS
+    finest = max(size // POINTS_PER_CLUSTER, few)
+    coarsest = size // DENSE_POINTS
     return max(1, min(max(count, coarsest), finest, MAX_CHOSEN))
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import native
+from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.fitting import (
     balance_classes,
     logistic_loss,
@@ -35,6 +36,7 @@ State = dict[str, Any]  # tensors and plain values, for `torch.save` and `torch.
 EVALUATION_POINTS = 1 << 16  # number of points used to evaluate the loss after each epoch
 
 
+@changes_map
 def fine_tune(
     model: MapParameters,
     points: Tensor,

@@ -1,9 +1,9 @@
 """Forgetting: evidence that a new scan contradicts.
 
-Free points near the center of an occupied cluster raise its doubt, and a hit resets it. A cluster in
-doubt is contradicted, and so is a cluster of unknown points that the map predicts as free or occupied. A
-contradicted cluster keeps a quarter of its evidence, however long it was observed before, so an obstacle
-that has been removed disappears after a few scans.
+Free points near the center of an occupied cluster raise its doubt, and a hit resets it. From `DOUBT` on,
+its points count less in training, so an obstacle that has been removed disappears after a few scans,
+however long it was observed before. A hit restores them: rays that graze a wall do not erase it. Points
+of unknown clusters are removed if the map predicts them as free or occupied.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lardhm_torch.points import UNKNOWN
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
 NARROWEST = 0.03  # [m] standard deviation of kernels here: few points pass through smaller ones
 DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
-FEWEST = 3  # contradicted clusters that would keep fewer points keep none
+GONE = 10 * DOUBT  # doubt at which a cluster is removed
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
 
 
@@ -57,22 +57,26 @@ def doubted(
     return doubts * known.is_occupied
 
 
-def contradicted(known: MapState) -> Tensor:
-    """(M,) mask of occupied clusters in doubt, and of unknown ones that other evidence overrules."""
-    return (known.doubts > DOUBT) | ((known.kinds == 2) & (known.losses > OVERRULED))
+def trust(doubts: Tensor) -> Tensor:
+    """(M,) doubts -> (M,) factor on the weights of kept points, 1 until a cluster is in doubt."""
+    return (DOUBT / doubts.clamp(min=DOUBT)) ** 8
 
 
-def forget(known: MapState, which: Tensor) -> MapState:
-    """Keep a quarter of the evidence and counts of the clusters in a mask, if enough points are left."""
+def forget(known: MapState, before: Tensor) -> MapState:
+    """The clusters without the points that others contradict.
+
+    Points of clusters far in doubt and of overruled unknown clusters are removed. Where trust changed,
+    the weights are to be trained again.
+
+    Args:
+        known: M clusters.
+        before: (M,) doubts before the new scan.
+    """
     kept = kept_counts(known.evidence)
-    left = torch.where(kept >= 4 * FEWEST, kept // 4, 0)
-    counts = torch.where(which, (known.counts + 3) // 4, known.counts)
-    fresh = torch.where(which, kept.to(known.fresh), known.fresh)
-    fraction = (counts - 1).clamp(min=1) / (known.counts - 1).clamp(min=1)
+    lost = (known.doubts > GONE) | ((known.kinds == 2) & (known.losses > OVERRULED))
+    changed = trust(known.doubts) != trust(before)
     return replace(
         known,
-        evidence=first_points(known.evidence, torch.where(which, left, kept)),
-        counts=counts,
-        fresh=fresh,
-        scatters=known.scatters * fraction.to(known.scatters)[:, None, None],
+        evidence=first_points(known.evidence, torch.where(lost, 0, kept)),
+        fresh=torch.where(changed | lost, kept.to(known.fresh), known.fresh),
     )

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors, lard_kernel, raw_factors
+from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
@@ -137,6 +138,21 @@ def _surroundings(state: MapState, kernel: Kernel) -> Iterator[Tensor]:
         yield state.means - factors[:, :, axis]
 
 
+def replace_clusters(
+    model: MapParameters, state: MapState, origin: Tensor, rows: Tensor | slice
+) -> None:
+    """Write clusters that were ``rows`` of the map and keep their features, with their posterior."""
+    means, variances = model.posterior_means[rows].clone(), model.posterior_variances[rows].clone()
+    scales = model.posterior_scales.clone()
+    write_state(model, state, origin)
+    model.posterior_means, model.posterior_variances, model.posterior_scales = (
+        means,
+        variances,
+        scales,
+    )
+
+
+@changes_map
 def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
     """Merge two maps into a new map in the frame of the first. The given maps are not modified.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import fields
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -11,12 +13,17 @@ from torch import Tensor, nn
 
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
+from lardhm_torch.learning.changes import normal_tensors
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, no_evidence
+from lardhm_torch.learning.state_checks import check_settings, check_values
 
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
 HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
 SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
+
+# OpenMP hangs in the child of a fork whose parent used it; DataLoader workers have one thread, too.
+os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
 class MapParameters(nn.Module):
@@ -58,7 +65,8 @@ class MapParameters(nn.Module):
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
         self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
-        self._register_empty(dim, device, dtype)
+        with normal_tensors():
+            self._register_empty(dim, device, dtype)
         self._index = torch.empty(0, dtype=torch.uint8)
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self.register_load_state_dict_pre_hook(make_room)
@@ -113,7 +121,7 @@ class MapParameters(nn.Module):
     @property
     def scale_tril(self) -> Tensor:
         """(M, D, D) lower Cholesky factors of the kernels [m], settings of the kernel applied."""
-        return kernel_factors(self.raw_scale_tril, self.kernel)
+        return kernel_factors(at_least_float32(self.raw_scale_tril), self.kernel)
 
     @property
     def kernel(self) -> Kernel:
@@ -170,10 +178,16 @@ class MapParameters(nn.Module):
     def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
         """Cast all tensors except the origin, which remains float64 (`.to()`, `.float()`, ...)."""
         origin = self.origin
-        super()._apply(fn, recurse)
+        with normal_tensors():
+            super()._apply(fn, recurse)
         if self.origin.dtype != torch.float64:
             self.origin = origin.to(self.origin.device)
         return self
+
+
+def at_least_float32(tensor: Tensor) -> Tensor:
+    """The tensor itself, or a float32 copy of one of half precision: maps never compute in that."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> None:
@@ -187,14 +201,15 @@ def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> No
     """
     if len(model) == num_clusters:
         return
-    for name, tensor in list(model.state_tensors()):
-        if name in PER_MAP:
-            continue
-        room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
-        if isinstance(tensor, nn.Parameter):
-            _set_shape(tensor, room)
-        else:
-            setattr(model, name, room)
+    with normal_tensors():
+        for name, tensor in list(model.state_tensors()):
+            if name in PER_MAP:
+                continue
+            room = _with_rows(model, name, num_clusters) if keep else _zeros(tensor, num_clusters)
+            if isinstance(tensor, nn.Parameter):
+                _set_shape(tensor, room)
+            else:
+                setattr(model, name, room)
 
 
 def _zeros(tensor: Tensor, rows: int) -> Tensor:
@@ -260,6 +275,7 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
                 f"got {tuple(state[prefix + name].shape)}"
             )
+    check_values({name: state[prefix + name] for name in own})
     resize(model, num_clusters)
 
 
@@ -381,17 +397,3 @@ def resize_optimizer(optimizer: torch.optim.Optimizer, model: MapParameters) -> 
                 )
             room = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
             optimizer.state[parameter][name] = torch.cat([value, room])
-
-
-def check_settings(
-    dim: int, num_neighbors: int, covariance_scale: float, min_lengthscale: float
-) -> None:
-    """Raise a ValueError if a setting of a map is out of range."""
-    for name, value in {"dim": dim, "num_neighbors": num_neighbors}.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a whole number, 1 or more; got {value!r}")
-    if not covariance_scale > 0 or not min_lengthscale > 0:
-        raise ValueError(
-            "covariance_scale and min_lengthscale must be > 0; "
-            f"got {covariance_scale} and {min_lengthscale}"
-        )

@@ -31,6 +31,7 @@ from lardhm_torch.learning.evidence import (
     kept_counts,
     kept_points,
 )
+from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState, factor_covariances, new_rows
 from lardhm_torch.points import in_morton_order
 
@@ -45,6 +46,7 @@ class Rule(NamedTuple):
     Args:
         kind: 0 occupied, 1 free, 2 unknown.
         limit: maximum number of clusters; more are dissolved, smallest first.
+        grows: clusters of new points in places without clusters raise the limit.
         few: there are so few hits that each may have a cluster of its own.
         split_loss: clusters with a larger mean loss are divided while there are fewer.
         floor: smallest standard deviation [m].
@@ -52,6 +54,7 @@ class Rule(NamedTuple):
 
     kind: int
     limit: int
+    grows: bool
     few: bool
     split_loss: float
     floor: float
@@ -77,14 +80,15 @@ def regrouped(known: MapState, points: Tensor, rule: Rule, rng: torch.Generator)
         state = state.put(owners[:0], _new_clusters(rest, rule, rng))
         owners = owners.masked_scatter(owners < 0, start + _nearest(rest, state.means[start:]))
     joined = torch.bincount(owners[owners >= 0], minlength=len(state))
-    alive = _kept(state, joined, rule)
+    limit = rule.limit + (len(state) - start if rule.grows else 0)
+    alive = _kept(state, joined, limit, rule.few)
     is_new = torch.arange(len(state), device=alive.device) >= start
     divided = torch.cat([divided, divided.new_zeros(len(state) - start)])
     touched = divided | (joined > 0) | is_new | ~alive
     evidence = _reassigned(state, points[owners >= 0], touched, alive)
     fresh = state.fresh + (evidence != state.evidence).any(dim=2).sum(dim=1)
     if rule.kind < 2:
-        state = replace(state, counts=state.counts + joined)
+        state = replace(state, counts=state.counts + _unseen(state, points, owners, joined))
     return _moved(replace(state, evidence=evidence, fresh=fresh), rule, len(known))
 
 
@@ -92,11 +96,12 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     """Divide clusters of large loss in two; the second halves are appended."""
     divided = torch.zeros_like(known.is_occupied)
     room = rule.limit - len(known)
-    large = (known.losses > rule.split_loss) & (kept_counts(known.evidence) >= SPLIT)
+    losses = known.losses * trust(known.doubts)
+    large = (losses > rule.split_loss) & (kept_counts(known.evidence) >= SPLIT)
     rows = large.nonzero().squeeze(1)
     if room <= 0 or len(rows) == 0:
         return known, divided
-    rows = rows[known.losses[rows].argsort(descending=True, stable=True)[:room]]
+    rows = rows[losses[rows].argsort(descending=True, stable=True)[:room]]
     first, second = halves(known.evidence[rows])
     sizes = torch.stack([kept_counts(first), kept_counts(second)])
     balanced = sizes.amin(dim=0) >= MIN_COUNT
@@ -109,7 +114,7 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     parents, share = known.rows(rows), sizes[0] / sizes.sum(dim=0)
     counts = (parents.counts * share).round().to(parents.counts)
     parts = [
-        _of_evidence(evidence, count, rule, parents.weights)
+        _of_evidence(evidence, count, rule, parents)
         for evidence, count in ((first, counts), (second, parents.counts - counts))
     ]
     both = MapState(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
@@ -117,14 +122,14 @@ def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
     return known.put(rows, both), divided
 
 
-def _of_evidence(evidence: Tensor, counts: Tensor, rule: Rule, weights: Tensor) -> MapState:
+def _of_evidence(evidence: Tensor, counts: Tensor, rule: Rule, parents: MapState) -> MapState:
     """Clusters with the moments of their evidence, which represents ``counts`` points."""
     found = evidence_moments(evidence)
     clusters = _represented(found, torch.zeros_like(counts) if rule.kind == 2 else counts)
     is_occupied = torch.full_like(counts, rule.kind == 0, dtype=torch.bool)
     rows = new_rows(clusters, is_occupied, rule.floor, evidence)
-    fresh = kept_counts(evidence).to(weights)
-    return replace(rows, weights=weights, fresh=fresh)
+    fresh = kept_counts(evidence).to(parents.fresh)
+    return replace(rows, weights=parents.weights, doubts=parents.doubts, fresh=fresh)
 
 
 def _represented(found: Clusters, counts: Tensor) -> Clusters:
@@ -144,17 +149,31 @@ def _new_clusters(points: Tensor, rule: Rule, rng: torch.Generator) -> MapState:
     )
 
 
+def _unseen(state: MapState, points: Tensor, owners: Tensor, joined: Tensor) -> Tensor:
+    """(M,) estimated number of the points joined to each cluster that it has not received before.
+
+    A cluster that keeps one in r of its points recognizes one in r of those that it receives again.
+    """
+    kept = kept_counts(state.evidence)
+    rows = ((owners >= 0) & (kept[owners] > 0)).nonzero().squeeze(1)
+    near = state.evidence[owners[rows]]
+    again = (near == points[rows][:, None]).all(dim=2).any(dim=1)
+    found = torch.bincount(owners[rows[again]], minlength=len(state))
+    represented = (state.counts / kept.clamp(min=1)).clamp(min=1)
+    return joined - torch.minimum(joined, (found * represented).round().to(joined))
+
+
 def _nearest(points: Tensor, centers: Tensor) -> Tensor:
     return native.nearest_centers(points, centers, 1).squeeze(1)
 
 
-def _kept(state: MapState, joined: Tensor, rule: Rule) -> Tensor:
+def _kept(state: MapState, joined: Tensor, limit: int, few: bool) -> Tensor:
     """(M,) mask of the clusters that are not dissolved."""
     sizes = kept_counts(state.evidence) + joined
-    alive = sizes >= (1 if rule.few else MIN_COUNT)
+    alive = sizes >= (1 if few else MIN_COUNT)
     if not bool(alive.any()):
         alive = sizes > 0
-    excess = int(alive.sum()) - max(1, rule.limit)
+    excess = int(alive.sum()) - max(1, limit)
     if excess > 0:
         alive[torch.where(alive, sizes, sizes.amax() + 1).argsort(stable=True)[:excess]] = False
     return alive

@@ -18,6 +18,7 @@ from lardhm_torch.learning.fitting import (
     label_factors,
     stratified_batches,
 )
+from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.points import UNKNOWN, morton_order
 
@@ -55,7 +56,7 @@ def retrained(
     points, owners = kept_points(state.evidence[rows])
     owners = rows[owners]
     kinds, strength = state.kinds[owners], evidence_weights(state)[owners]
-    factors = balanced(kinds, strength, config)
+    factors = balanced(kinds, strength, config) * trust(state.doubts)[owners]
     labels = KIND_LABELS.to(points)[kinds]
     fewest = max(1, len(points) // MIN_BATCHES)
     config = replace(config, batch_size=min(config.rows_per_batch(len(points)), fewest))

@@ -20,20 +20,20 @@ from lardhm_torch.learning.assignment import kernels_near
 from lardhm_torch.learning.cluster_matching import merge_clusters
 from lardhm_torch.learning.clustering import (
     FEW_POINTS,
-    MAX_CHOSEN,
-    POINTS_PER_CLUSTER,
+    choose_num_clusters,
     cluster_classes,
     split_labels,
     spread_rows,
 )
-from lardhm_torch.learning.evidence import kept_counts, with_evidence
+from lardhm_torch.learning.evidence import kept_counts, kept_points, with_evidence
 from lardhm_torch.learning.fitting import FitConfig, FitTask
-from lardhm_torch.learning.forgetting import contradicted, doubted, forget
+from lardhm_torch.learning.forgetting import doubted, forget
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
 from lardhm_torch.points import UNKNOWN, in_morton_order
 
+MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
 UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown
 BOX_STDS = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
 UPDATE_FIT = FitConfig(passes=4, batch_size=1024)
@@ -105,9 +105,9 @@ def updated(
     few = int(state.counts[state.is_occupied].sum() + (labels > UNKNOWN).sum()) <= FEW_POINTS
     points, labels = _thinned(points, labels, config.max_points, rng)
     points, labels = _still_unknown(part, points, labels, kernel, index)
+    before = part.doubts
     part = replace(part, doubts=doubted(part, points, labels, kernel, index))
-    lost = contradicted(part)
-    part = _regrouped(forget(part, lost), points, labels, num_clusters, few, task)
+    part = _regrouped(forget(part, before), points, labels, num_clusters, few, task)
     alive = kept_counts(part.evidence) > 0
     part = retrained(part.rows(alive), config.max_trained, kernel, config.fit, rng)
     return _without(nearby, part, alive)
@@ -164,10 +164,11 @@ def _regrouped(
     """All classes regrouped with their new points."""
     kinds, floor = part.kinds, task.kernel.min_lengthscale
     classes = split_labels(points, labels)
-    limit = _most_occupied(part, len(classes[0]), num_clusters, few)
+    limit = _most_occupied(part, classes[0], num_clusters)
     for kind, members in enumerate(classes):
         own = (kinds == kind).nonzero().squeeze(1)
-        rule = Rule(kind, max(limit, len(own)), few, task.config.split_loss, floor)
+        grows = num_clusters is None
+        rule = Rule(kind, max(limit, len(own)), grows, few, task.config.split_loss, floor)
         if len(own) or len(members):
             part = part.put(own, regrouped(part.rows(own), members, rule, task.rng))
         if kind == 0:  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
@@ -177,12 +178,18 @@ def _regrouped(
     return part
 
 
-def _most_occupied(part: MapState, num_hits: int, num_clusters: int | None, few: bool) -> int:
-    """Maximum number of occupied clusters near a scan."""
+def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None) -> int:
+    """Number of occupied clusters up to which those near a scan are divided.
+
+    It is the number that `fit` would use for the points that they have received so far.
+    """
     if num_clusters is not None:
         return num_clusters // 4
-    hits = int(part.counts[part.is_occupied].sum()) + num_hits
-    return min(MAX_CHOSEN, max(hits if few else 1, hits // POINTS_PER_CLUSTER))
+    kept, _ = kept_points(part.evidence[part.is_occupied])
+    if len(kept) == 0:
+        return choose_num_clusters(hits)
+    represented = int(part.counts[part.is_occupied].sum())
+    return int(MORE * choose_num_clusters(kept, represented=represented))
 
 
 def _as_in_paper(

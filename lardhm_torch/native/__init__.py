@@ -17,9 +17,7 @@ from lardhm_torch import features
 from lardhm_torch.features import Kernel
 from lardhm_torch.native import surfaces
 from lardhm_torch.native.build import available as library_available
-
-DIMENSIONS = (2, 3)
-DTYPES = (torch.float32, torch.float64)
+from lardhm_torch.native.operators import DTYPES, definition, fits, transformed
 
 _registered = False
 
@@ -35,10 +33,13 @@ def available() -> bool:
     return True
 
 
-def supports(points: Tensor) -> bool:
-    """Whether the kernel answers for (N, D) points of this device, dtype and dimension."""
-    fits = points.device.type == "cpu" and points.dtype in DTYPES
-    return fits and points.shape[-1] in DIMENSIONS and available()
+def supports(*tensors: Tensor) -> bool:
+    """Whether the kernel answers for tensors like these; the first is (N, D).
+
+    It does for the CPU, float32 and float64, 2-D and 3-D, but not under the transforms of `torch.func`
+    nor for dual tensors: the definition batches itself and pushes tangents forward.
+    """
+    return fits(tensors[0]) and available() and not transformed(*tensors)
 
 
 def build_index(centers: Tensor, num_neighbors: int) -> Tensor:
@@ -50,6 +51,8 @@ def build_index(centers: Tensor, num_neighbors: int) -> Tensor:
 
 def index_matches(index: Tensor, centers: Tensor, num_neighbors: int) -> bool:
     """Whether an index was made from exactly these centers."""
+    if index.device != centers.device:
+        return False
     if not supports(centers):
         return len(index) == 0
     return torch.ops.lardhm.index_matches(index, centers.detach(), num_neighbors)
@@ -79,14 +82,11 @@ def occupancy(
 
     An index saves the time to make one.
     """
-    if not supports(points):
-        factors = features.kernel_factors(raw_scale_tril, kernel)
-        answer = features.log_odds(points, centers, factors, weights, kernel.num_neighbors)
-        return torch.sigmoid(answer) if probability else answer
+    tensors = (points, centers, raw_scale_tril, weights)
+    if not supports(*tensors):
+        return definition(tensors, kernel, probability)
     index = build_index(centers, kernel.num_neighbors) if index is None else index
-    return torch.ops.lardhm.occupancy(
-        points, centers, raw_scale_tril, weights, *kernel, index, probability
-    )
+    return torch.ops.lardhm.occupancy(*tensors, *kernel, index, probability)
 
 
 def lattice_occupancy(
@@ -218,7 +218,7 @@ def descends(indices: Tensor, values: Tensor) -> bool:
 
 
 def _register() -> None:
-    """Shapes for `torch.compile` and `torch.export`, and the gradient."""
+    """Shapes for `torch.compile` and `torch.export`."""
     library = torch.library
 
     @library.register_fake("lardhm::build_index")
@@ -234,10 +234,6 @@ def _register() -> None:
     def _(points: Tensor, centers: Tensor, raw: Tensor, index: Tensor, k: int, *_: Any) -> Any:
         shape = (points.shape[0], min(k, centers.shape[0]))
         return points.new_empty(shape, dtype=torch.int32), points.new_empty(shape)
-
-    @library.register_fake("lardhm::occupancy")
-    def _(points: Tensor, *_: Any) -> Tensor:
-        return points.new_empty(points.shape[0])
 
     @library.register_fake("lardhm::lattice_occupancy")
     def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:
@@ -308,39 +304,3 @@ def _register() -> None:
         return tuple(torch.empty_like(t) for t in (counts, means, scatters, means, raw))
 
     surfaces.register()
-    library.register_autograd("lardhm::occupancy", _backward, setup_context=_keep_inputs)
-
-
-def _keep_inputs(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    *tensors, k, scale, floor, index, ctx.probability = inputs
-    ctx.kernel = Kernel(k, scale, floor)
-    ctx.save_for_backward(*tensors, index)
-
-
-def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    *inputs, index = ctx.saved_tensors
-    needed = ctx.needs_input_grad[:4]
-    if torch.is_grad_enabled():  # the gradient itself is to be differentiated
-        grads = _differentiable_gradients(grad, inputs, needed, ctx.kernel, ctx.probability)
-    else:
-        wanted = sum(1 << bit for bit in range(4) if needed[bit])
-        computed = torch.ops.lardhm.occupancy_backward(
-            grad, *inputs, *ctx.kernel, index, ctx.probability, wanted
-        )
-        grads = [g if wanted >> bit & 1 else None for bit, g in enumerate(computed)]
-    return (*grads, None, None, None, None, None)
-
-
-def _differentiable_gradients(
-    grad: Tensor, inputs: list[Tensor], needed: Any, kernel: Kernel, probability: bool
-) -> list[Tensor | None]:
-    points, centers, raw_scale_tril, weights = inputs
-    indices = nearest_centers(points, centers, kernel.num_neighbors)
-    factors = features.kernel_factors(raw_scale_tril, kernel)
-    values = features.lard_kernel(points, centers, factors, indices)
-    values = values * features.neighbor_fade(points, centers, indices)
-    answer = (values * weights[indices]).sum(dim=1)
-    answer = torch.sigmoid(answer) if probability else answer
-    asked = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
-    found = iter(torch.autograd.grad(answer, asked, grad, create_graph=True))
-    return [next(found) if need else None for need in needed]

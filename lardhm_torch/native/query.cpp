@@ -318,6 +318,7 @@ Tensor cube_log_odds(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyA
 }  // namespace
 }  // namespace lardhm
 
+// operators.py defines `occupancy`, before this library is loaded.
 STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
   m.def("build_index(Tensor centers, int k) -> Tensor");
   m.def("index_matches(Tensor index, Tensor centers, int k) -> bool");
@@ -328,9 +329,6 @@ STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
   m.def(
       "ordered_features(Tensor points, Tensor order, Tensor centers, Tensor raw_scale_tril, "
       "Tensor index, int k, float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
-  m.def(
-      "occupancy(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor weights, int k, "
-      "float covariance_scale, float min_lengthscale, Tensor index, bool probability) -> Tensor");
   m.def(
       "lattice_occupancy(Tensor axes, int[] shape, Tensor centers, Tensor raw_scale_tril, "
       "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "

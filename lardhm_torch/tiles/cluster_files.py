@@ -125,4 +125,5 @@ def _read(path: Path, like: Tensor) -> tuple[int, NDArray[Any]] | None:
     body = content[_HEAD_BYTES:]
     if len(body) != rows * columns * like.element_size() or zlib.crc32(body.data) != checksum:
         return None
-    return num_points, body.view(_kind(like)).reshape(rows, columns)
+    table = body.view(_kind(like)).reshape(rows, columns)
+    return (num_points, table) if np.isfinite(table).all() and (table[:, 1] >= 0).all() else None

@@ -16,6 +16,7 @@ from torch import Tensor
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.map_files import check_settings, decode_safetensors
 from lardhm_torch.learning.parameters import PER_MAP
+from lardhm_torch.learning.state_checks import check_values
 from lardhm_torch.tiles.entries import Tile
 from lardhm_torch.tiles.indexing import Folder, Index, tile_name, tile_path
 from lardhm_torch.tiles.manifest import Manifest
@@ -117,6 +118,7 @@ class TileStore:
                     f"{name} must be {tuple(rows)} of dtype {empty.dtype}; "
                     f"{path} has {tuple(state[name].shape)} of dtype {state[name].dtype}"
                 )
+        check_values({name: state[name] for name in self._empty})
 
 
 class Cache:
