@@ -1,29 +1,49 @@
-# Every target first installs the package into .venv.
+# Every target first installs what it needs into .venv, with the versions of constraints.txt.
 #
-# make demo   simulate a room, fit a map, evaluate it and draw it (out/)
-# make test   run linter, type checker and tests
-# make docs   build the documentation (out/docs/index.html); warnings are errors
-# make bench  run the benchmarks (minutes)
-# make soak   run the long tests: fuzzing, flipped bits, kills, full disks (tens of minutes)
+# make demo      simulate a room, fit a map, evaluate it and draw it (out/); installs the package alone
+# make test      run linter, type checker and all tests
+# make check     the same with the quickest tests of every part
+# make docs      build the documentation (out/docs/index.html); warnings are errors
+# make wheel     build the pure wheel and the one for Linux on x86-64 with the kernel (out/wheels/)
+# make try-wheel install the latter without a compiler; compare its speed with a kernel compiled here
+# make versions  try that wheel with old and new versions of Python and the libraries (gigabytes)
+# make sanitize  run the native tests with AddressSanitizer and UndefinedBehaviorSanitizer (minutes)
+# make bench     run the benchmarks (minutes)
+# make soak      run the long tests: fuzzing, flipped bits, kills, full disks (tens of minutes)
 
 PYTHON ?= python3
 BIN := .venv/bin
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+	$(shell grep -o '^torch==[^ ]*' constraints.txt)
+WHEELS := out/wheels
+QUICK := public scans sampling features io_npz simulation kernel_cache native_query native_extremes \
+	native_gradients native_update marching atomic_files
 export MPLBACKEND := Agg
 
-.PHONY: demo test bench soak docs
+.PHONY: demo test check bench soak docs wheel try-wheel versions sanitize
 .DELETE_ON_ERROR:
+
+.venv/demo: pyproject.toml constraints.txt
+	@echo "installing torch and the other libraries into .venv; pip downloads what its cache lacks"
+	$(PYTHON) -m venv .venv
+	$(INSTALL) -e .
+	@touch $@
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-		$(shell grep -o '^torch==[^ ]*' constraints.txt) -e '.[dev]'
-	touch $@
+	$(INSTALL) -e '.[dev]'
+	touch $@ .venv/demo
 
 .venv/bench: .venv/ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(INSTALL) -e '.[bench]'
 	touch $@
 
-demo: .venv/ready
+.venv/wheel: .venv/ready
+	$(INSTALL) -e '.[wheel]'
+	touch $@
+
+demo: .venv/demo
+	@echo "running the demo: about a minute, most of it to compile the kernel the first time"
 	$(BIN)/python scripts/demo.py out
 
 test: .venv/ready
@@ -31,6 +51,24 @@ test: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+check: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest $(QUICK:%=tests/test_%.py)
+
+wheel: .venv/wheel
+	$(BIN)/python scripts/wheels/build_wheels.py $(WHEELS)
+
+try-wheel: wheel
+	$(BIN)/python scripts/wheels/try_wheels.py $(WHEELS)
+
+versions: wheel
+	$(BIN)/python scripts/versions/try_versions.py $(WHEELS)/*manylinux*.whl
+
+sanitize: .venv/ready
+	$(BIN)/python scripts/sanitize.py
 
 docs: .venv/ready
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs

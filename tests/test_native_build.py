@@ -1,6 +1,7 @@
 """The native library is built once, safely, and never needed."""
 
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 from lardhm_torch import native
-from lardhm_torch.native import build
+from lardhm_torch.native import build, compiling
 
 ROOT = Path(__file__).parents[1]
 
@@ -46,6 +47,7 @@ def ask_in_process(**environment: str) -> str:
 def test_without_a_compiler_one_warning_names_the_cause_and_the_cure(tmp_path):
     answer = ask_in_process(CXX="no-such-compiler", LARDHM_CACHE=str(tmp_path), LARDHM_NATIVE="1")
     assert answer.startswith("False 1 ")
+    assert f"no compiled kernel is installed for {platform.system()} on" in answer
     assert "no-such-compiler" in answer
     assert "LARDHM_NATIVE=0" in answer
 
@@ -86,19 +88,9 @@ def test_a_killed_build_leaves_nothing_that_blocks_the_next(tmp_path, monkeypatc
     quick = stub_compiler(tmp_path, 'echo whole > "$target"')
     monkeypatch.setenv("CXX", str(quick))
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
-    library = build._cached_library()
+    library = build._compiled_library()
     assert library.read_text() == "whole\n"
     assert library.parent == tmp_path / "cache"
-
-
-def test_an_unwritable_cache_is_replaced_by_a_temporary_folder(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv("CXX", str(stub_compiler(tmp_path, 'echo whole > "$target"')))
-    monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(build.tempfile, "gettempdir", lambda: str(tmp_path))
-    library = build._cached_library()
-    assert library.read_text() == "whole\n"
-    assert tmp_path in library.parents
 
 
 def test_two_builds_at_once_both_succeed(tmp_path, monkeypatch):
@@ -106,7 +98,7 @@ def test_two_builds_at_once_both_succeed(tmp_path, monkeypatch):
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
     built: list[Path] = []
     threads = [
-        threading.Thread(target=lambda: built.append(build._cached_library())) for _ in range(2)
+        threading.Thread(target=lambda: built.append(build._compiled_library())) for _ in range(2)
     ]
     for thread in threads:
         thread.start()
@@ -119,26 +111,36 @@ def test_two_builds_at_once_both_succeed(tmp_path, monkeypatch):
 
 
 def test_a_damaged_library_in_the_cache_is_built_anew(ops, tmp_path, monkeypatch):
-    sound = build._cached_library()
+    sound = build._compiled_library()
     compiler = stub_compiler(tmp_path, f'cp "{sound}" "$target"')
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setenv("LARDHM_CACHE", str(tmp_path / "cache"))
-    damaged = build._cached_library()
+    damaged = build._compiled_library()
     damaged.write_bytes(b"no library")
     environment = {"CXX": str(compiler), "LARDHM_CACHE": str(tmp_path / "cache")}
     assert ask_in_process(LARDHM_NATIVE="1", **environment) == "True 0"
     assert damaged.read_bytes() == sound.read_bytes()
 
 
-def test_a_change_of_source_or_compiler_is_another_library(tmp_path, monkeypatch):
-    first = build._cache_key(["c++"])
-    assert first == build._cache_key(["c++"])
-    assert first != build._cache_key(["g++"])
-    changed = shutil.copytree(build.FOLDER, tmp_path / "native")
+def test_a_change_of_source_torch_compiler_or_processor_is_another_library(tmp_path, monkeypatch):
+    compiler = tmp_path / "c++"
+    compiler.write_text("version 1")
+    command = [str(compiler)]
+    names = [compiling.hash_build(command)]
+    assert compiling.hash_build(command) == names[0]
+    names.append(compiling.hash_build([*command, "-O1"]))
+    compiler.write_text("version 1.1")  # an update in place
+    names.append(compiling.hash_build(command))
+    monkeypatch.setattr(torch, "__version__", "2.99")
+    names.append(compiling.hash_build(command))
+    monkeypatch.setattr(compiling, "_processor", lambda: b"flags: sse2")
+    names.append(compiling.hash_build(command))
+    changed = shutil.copytree(compiling.SOURCES, tmp_path / "native")
     with (changed / "index.h").open("a") as source:
         source.write("\n")
-    monkeypatch.setattr(build, "FOLDER", changed)
-    assert first != build._cache_key(["c++"])
+    monkeypatch.setattr(compiling, "SOURCES", changed)
+    names.append(compiling.hash_build(command))
+    assert len(set(names)) == len(names)
 
 
 def test_importing_the_package_builds_and_loads_nothing(tmp_path):

@@ -40,12 +40,12 @@ struct IndexBuilder {
   IndexBuilder(const T* centers_, int64_t count) : centers(centers_) {
     Box<T, D> box;
     box.add(centers, 0, count, 1);
-    const bool any = box.low[0] <= box.high[0];
     header.magic = kMagic;
     header.count = count;
     header.dim = D;
     header.item_size = sizeof(T);
     for (int d = 0; d < D; ++d) {
+      const bool any = box.low[d] <= box.high[d];  // finite coordinates
       header.low[d] = any ? double(box.low[d]) : 0.0;
       header.high[d] = any ? double(box.high[d]) : 0.0;
     }

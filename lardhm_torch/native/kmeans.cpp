@@ -147,6 +147,7 @@ Tensor z_order(const Tensor& given_points) {
   dispatch(points, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim(), kBits = 10;
+    constexpr T last = (1 << kBits) - 1;
     Box<T, D> box;
     box.add(in<T>(points), 0, n, 1);
     T edge = std::numeric_limits<T>::min();
@@ -160,8 +161,8 @@ Tensor z_order(const Tensor& given_points) {
     for (int64_t i = 0; i < n; ++i) {
       uint32_t key = 0;
       for (int d = 0; d < D; ++d) {
-        const T at = (from[i * D + d] - box.low[d]) / edge * T((1 << kBits) - 1);
-        key |= spread[at > 0 ? std::min(int32_t(at), (1 << kBits) - 1) : 0] << d;
+        const T at = (from[i * D + d] - box.low[d]) / edge * last;
+        key |= spread[at > 0 ? int32_t(std::min(at, last)) : 0] << d;  // NaN: 0
       }
       sorter.items[i] = uint64_t(key) << 32 | uint64_t(i);
     }

@@ -29,6 +29,7 @@ template <int Bytes>
 struct Vectors<float, Bytes> {
   typedef float V __attribute__((vector_size(Bytes)));
   typedef int32_t I __attribute__((vector_size(Bytes)));
+  typedef uint32_t U __attribute__((vector_size(Bytes)));
   using Int = int32_t;
 };
 
@@ -36,6 +37,7 @@ template <int Bytes>
 struct Vectors<double, Bytes> {
   typedef double V __attribute__((vector_size(Bytes)));
   typedef int64_t I __attribute__((vector_size(Bytes)));
+  typedef uint64_t U __attribute__((vector_size(Bytes)));
   using Int = int64_t;
 };
 
@@ -160,7 +162,7 @@ struct ExpConstants<double> {
 template <class T>
 __attribute__((always_inline)) inline typename Simd<T>::V exp_of(typename Simd<T>::V x) {
   using V = typename Simd<T>::V;
-  using I = typename Simd<T>::I;
+  using U = typename Simd<T>::U;  // may overflow, where the result is 0
   using C = ExpConstants<T>;
   const V shifted = x * T(1.4426950408889634) + C::shifter;
   const V n = shifted - C::shifter;
@@ -173,7 +175,7 @@ __attribute__((always_inline)) inline typename Simd<T>::V exp_of(typename Simd<T
     factorial /= i;  // exact: a factorial again
     y = y * rest + 1 / factorial;
   }
-  const V scaled = (V)((I)y + ((I)shifted << C::mantissa));
+  const V scaled = (V)((U)y + ((U)shifted << C::mantissa));
   return x < C::lowest ? V{} : scaled;
 }
 

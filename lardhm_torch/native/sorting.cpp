@@ -70,8 +70,9 @@ void Sorter::sort(int key_bits) {
 }
 
 template <int D>
-ZCurve<D>::ZCurve(const double* edges, double cells) {
-  double largest = 0, volume = 1, shortest = 0;
+ZCurve<D>::ZCurve(const double* given, double cells) {
+  double edges[D], largest = 0, volume = 1, shortest = 0;
+  for (int d = 0; d < D; ++d) edges[d] = std::max(0.0, given[d]);  // -inf: nothing is finite
   for (int d = 0; d < D; ++d) largest = std::max(largest, edges[d]);
   shortest = largest / 1024;
   for (int d = 0; d < D; ++d) volume *= std::max(edges[d], shortest);
