@@ -95,7 +95,7 @@ CHOICES = {
     "same samples every epoch": Choice(resample=False),
     "fine-tuned with l2 = 0.05": Choice(tune={"l2": 0.05}),
     "no stiffness": Choice(tune={"stiffness": 0.0}),
-    "24 epochs": Choice(tune={"epochs": 24}),
+    "8 epochs": Choice(tune={"epochs": 8}),
     "best epoch on 10 % of the rays": Choice(tune={"hold_out": 0.1}),
     "length-scales frozen": Choice(tune={"tune_scales": False}),
     "centers frozen": Choice(tune={"tune_centers": False}),

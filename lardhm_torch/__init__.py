@@ -22,6 +22,9 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.learning.map_merging import merge_maps as merge_maps
     from lardhm_torch.learning.parameters import resize_optimizer as resize_optimizer
     from lardhm_torch.learning.update import UpdateConfig as UpdateConfig
+    from lardhm_torch.packets import PacketReceiver as PacketReceiver
+    from lardhm_torch.packets import PacketSender as PacketSender
+    from lardhm_torch.packets import PacketWriter as PacketWriter
     from lardhm_torch.queries.bodies import Body as Body
     from lardhm_torch.queries.bodies import body_collision_probability as body_collision_probability
     from lardhm_torch.queries.bodies import body_distance as body_distance
@@ -69,6 +72,7 @@ _NAMES = {
     "learning.map_merging": ["merge_maps"],
     "learning.parameters": ["resize_optimizer"],
     "learning.update": ["UpdateConfig"],
+    "packets": ["PacketReceiver", "PacketSender", "PacketWriter"],
     "queries.bodies": [
         "Body",
         "body_collision_probability",

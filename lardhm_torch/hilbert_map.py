@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lardhm_torch import packing
 from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import (
@@ -106,6 +107,7 @@ class LardHilbertMap(MapQueries):
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
+        self.check_learns()
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers)
         check_num_clusters(num_clusters)
@@ -231,6 +233,7 @@ class LardHilbertMap(MapQueries):
         Raises:
             ValueError: the map is empty, or the samples are invalid (see `fit`).
         """
+        self.check_learns()
         if len(self) == 0:
             raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
         local, labels, _ = training_points(points, labels, self.centers, self.origin)
@@ -275,6 +278,7 @@ class LardHilbertMap(MapQueries):
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
+        self.check_learns()
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
@@ -341,28 +345,35 @@ class LardHilbertMap(MapQueries):
 
         Args:
             path: file; the extension ``.safetensors`` selects that format.
-            evidence: write the points kept by the clusters, too. Without them, the file is about a
-                quarter as large, and a later `update` continues with points drawn from the moments of
-                the clusters.
+            evidence: write the points kept by the clusters, too. Without them the file is about a
+                quarter as large, and a later `update` draws points from the clusters' moments.
         """
         state = self.state_dict()
         if not evidence:
             state = {name: value for name, value in state.items() if name not in HISTORY}
         map_files.save_state(occupied_sums(state), path)
 
+    def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:
+        """Write a small file, about 12 bytes per cluster in 3-D, of a map that answers but cannot learn.
+
+        Channels are left out.
+
+        Args:
+            path: file, usually ``.lhm``.
+            precision: fractional bits of the rounded parameters, 1 to 16 (docs/map_format.md).
+        """
+        packing.save_packed(self, path, precision)
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:
-        """Read a map file written by `save` or by `torch.save(model.state_dict(), ...)`.
+        """Read a map file written by `save`, `pack` or `torch.save(model.state_dict(), ...)`.
 
         Raises:
             FileNotFoundError: the file does not exist.
             ValueError: the file is not a map, is damaged or unsafe, or has a newer format.
         """
-        state = map_files.load_state(path)
+        state = packing.load_state(path)
         try:
-            settings = map_files.map_settings(state)
-            model = cls(**settings, dtype=state["centers"].dtype)
-            model.load_state_dict(state)
+            return cls.from_state(state)
         except (KeyError, AttributeError, TypeError, RuntimeError, ValueError) as error:
             raise ValueError(f"{os.fspath(path)} must hold a LardHilbertMap; {error}") from error
-        return model

@@ -1,6 +1,6 @@
 """Fine-tune the length scales of a saved map on new scans; centers and weights are kept.
 
-Usage: python scripts/finetune.py map.pt SCANS -o tuned.pt [--epochs 12]
+Usage: python scripts/finetune.py map.pt SCANS -o tuned.pt [--epochs 4]
 """
 
 import argparse
@@ -31,6 +31,6 @@ if __name__ == "__main__":
     parser.add_argument("map")
     parser.add_argument("scans")
     parser.add_argument("-o", "--output", default="tuned.pt")
-    parser.add_argument("--epochs", type=int, default=12)
+    parser.add_argument("--epochs", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     main(parser.parse_args())

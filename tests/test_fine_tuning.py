@@ -5,7 +5,7 @@ import torch
 
 from lardhm_torch import FitConfig, LardHilbertMap, Samples, TuneConfig, fine_tune
 from lardhm_torch.io.map_files import load_state, save_state
-from lardhm_torch.learning.fine_tuning import LabelledPoints, _hold_out, batches
+from lardhm_torch.learning.fine_tuning import _check, _hold_out
 from lardhm_torch.sampling import seeded_generator
 
 F64 = torch.float64
@@ -76,21 +76,22 @@ def test_factors_stay_valid_at_absurd_rates():
 def test_the_epoch_that_predicts_held_out_rays_best_is_kept():
     model, points, labels = fitted()
     ray_id = torch.arange(len(points)) % 50
-    config = TuneConfig(epochs=4, hold_out=0.3, weight_rate=30.0)  # so fast that it gets worse
+    config = TuneConfig(epochs=4, hold_out=0.3, weight_rate=3.0)  # so fast that it gets worse
     states = []
     losses = fine_tune(
         model, points, labels, ray_id=ray_id, config=config, after_epoch=states.append
     )
     best = losses.index(min(losses[1:]))
     assert 1 <= best < 4
-    assert torch.equal(model.weights, states[best - 1]["best"][0])
+    assert torch.equal(model.weights, states[best - 1]["best"][:, 0])
 
 
 def test_held_out_rays_do_not_train_even_when_sampled_anew():
     model, points, labels = fitted()
     ray_id = torch.arange(len(points)) % 50
     liar, config = copy.deepcopy(model), TuneConfig(epochs=3, hold_out=0.3)
-    held = _hold_out(LabelledPoints(points, labels, ray_id), 0.3, seeded_generator(0, "fine_tune"))
+    samples = _check(model, points, labels, ray_id)
+    held = _hold_out(samples, 0.3, seeded_generator(0, "fine_tune"))
     assert 5 < len(held) < 30
     lies = torch.where(torch.isin(ray_id, held), 1 - labels, labels)
     ends, epochs = [], []
@@ -107,8 +108,7 @@ def test_held_out_rays_do_not_train_even_when_sampled_anew():
         )  # fmt: skip
         ends.append(states[-1]["offsets"])
     assert epochs == [1, 2, 1, 2]
-    for honest, lied in zip(*ends, strict=True):
-        torch.testing.assert_close(honest, lied)
+    torch.testing.assert_close(*ends)
 
 
 def test_tuning_stops_when_patience_is_over():
@@ -159,14 +159,14 @@ def test_a_state_of_another_map_or_config_is_refused():
         fine_tune(other, points, labels, config=config, state=states[0])
 
 
-@pytest.mark.parametrize(("count", "batch"), [(1, 4), (10, 3), (1000, 64), (64, 64)])
-def test_batches_hold_every_row_once_and_some_of_every_stretch(count, batch):
-    rng = torch.Generator().manual_seed(0)
-    taken = list(batches(count, batch, rng))
-    assert torch.equal(torch.cat(taken).sort().values, torch.arange(count))
-    assert max(map(len, taken)) <= batch
-    for rows in taken:
-        assert (rows.diff() < 2 * len(taken)).all()
+def test_many_points_are_tuned_in_groups(monkeypatch):
+    model, points, labels = fitted(num_clusters=8, config=FitConfig(passes=4))
+    apart, states = copy.deepcopy(model), []
+    at_once = fine_tune(model, points, labels)
+    monkeypatch.setattr("lardhm_torch.learning.fine_tuning.GROUP_ROWS", 1500)
+    in_groups = fine_tune(apart, points, labels, after_epoch=states.append)
+    assert states[-1]["step"] == 4 * 3 * 6  # three groups of two batches
+    assert in_groups[-1] == pytest.approx(at_once[-1], rel=0.2)
 
 
 def test_a_failure_leaves_the_map_as_it_was(monkeypatch):
@@ -196,6 +196,7 @@ def test_what_cannot_be_tuned_is_refused():
     ("settings", "message"),
     [
         ({"epochs": 0}, "epochs must be 1 or more; got 0"),
+        ({"passes": 0}, "passes must be 1 or more; got 0"),
         ({"batch_size": 0}, "batch_size must be 1 or more; got 0"),
         ({"weight_rate": 0.0}, "rates must be > 0"),
         ({"stiffness": -1.0}, "l2 and stiffness must be 0 or more"),

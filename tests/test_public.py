@@ -36,7 +36,8 @@ def sections_missing(function):
 
 def test_the_fixed_names_are_public():
     fixed = """
-        Body FitConfig LardHilbertMap MapViewer Mover Samples SamplingConfig ScanReport Scans
+        Body FitConfig LardHilbertMap MapViewer Mover PacketReceiver
+        PacketSender PacketWriter Samples SamplingConfig ScanReport Scans
         StreamConfig TiledMap TuneConfig UpdateConfig body_collision_probability body_distance
         capsule_distance channel clearance collision_probability evaluate expected_range extract_mesh
         fine_tune free_probability frontiers grid information_gain iter_scans load_points load_scans

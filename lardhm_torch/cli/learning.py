@@ -73,6 +73,10 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
 
     if arguments.resume or arguments.view or arguments.radius is not None:
         raise ValueError("--resume, --view and --radius need --incremental")
+    if arguments.send is not None or arguments.precision is not None:
+        raise ValueError(
+            "--send and --precision need --incremental; `lardhm pack` packs a finished map"
+        )
     state = _tune_state(arguments.tune_state)
     scans = read_scans(arguments)
     samples = sample_rays(scans, sampling_of(arguments), seed=arguments.seed)
@@ -169,7 +173,14 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
             raise ValueError("SCANS must hold at least one ray; got none")
         scans, done = itertools.chain([first], scans), None
         model = _new_map(first.dim, arguments)
-    with _live_view(arguments.view) as after_scan:
+    send = _packet_writer(arguments)
+    with _live_view(arguments.view) as show:
+        watchers = [watch for watch in (send, show) if watch is not None]
+
+        def after_scan(model: LardHilbertMap) -> None:
+            for watch in watchers:
+                watch(model)
+
         seen = stream_scans(
             model, scans, config, path=arguments.output, done=done,
             after_scan=after_scan, progress=True,
@@ -180,6 +191,18 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         f"{seen.scans} scans, {seen.rays} rays -> {len(model)} clusters -> {arguments.output}"
         f"{far_hits(arguments)}"
     )
+
+
+def _packet_writer(arguments: argparse.Namespace) -> Callable[[LardHilbertMap], None] | None:
+    """The function that writes a packet after each scan; None if not wanted."""
+    if arguments.send is None:
+        if arguments.precision is not None:
+            raise ValueError("--precision needs --send")
+        return None
+    from lardhm_torch.packets import PacketWriter
+
+    settings = {} if arguments.precision is None else {"precision": arguments.precision}
+    return PacketWriter(arguments.send, resume=arguments.resume, **settings).send
 
 
 @contextmanager

@@ -117,6 +117,13 @@ def _fit(sub: argparse.ArgumentParser) -> None:
         metavar="N",
         help="with --incremental: write a checkpoint every N scans (default: 1)",
     )
+    sub.add_argument(
+        "--send",
+        metavar="PATH",
+        help="with --incremental: after each scan, write what changed in the map as a packet, to a "
+        "folder or at the end of a .lhm file",
+    )
+    _precision(sub)
     _radius(sub)
     add_ranges(sub)
     _dim(sub)
@@ -194,6 +201,11 @@ def _file_verbs(verb: Any) -> None:
         default="trinary",
         help="with --nav2: three values, or probabilities of known cells (default: trinary)",
     )
+
+    sub = verb(queries.pack)
+    sub.add_argument("map", metavar="MAP", help=f"{MAP}; or packets, written by fit --send")
+    _output(sub, "packed map to write: .lhm")
+    _precision(sub)
 
 
 def _picture_verbs(verb: Any) -> None:
@@ -318,6 +330,15 @@ def _radius(sub: argparse.ArgumentParser) -> None:
 
 def _seed(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--seed", type=int, default=0, help="random seed (default: 0)")
+
+
+def _precision(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--precision",
+        type=int,
+        metavar="BITS",
+        help="fractional bits of packed parameters, 1 to 16 (default: 6)",
+    )
 
 
 def _resolution(sub: argparse.ArgumentParser, default: float) -> None:

@@ -102,6 +102,19 @@ def grid(arguments: argparse.Namespace) -> None:
         print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
 
+def pack(arguments: argparse.Namespace) -> None:
+    """Write a small file of a map, to be sent: it answers queries, but does not learn."""
+    from lardhm_torch.tiles.tiled_map import TiledMap, open_map
+
+    check_output(arguments.output, (".lhm",), [arguments.map])
+    opened = open_map(arguments.map)
+    model = opened.merge() if isinstance(opened, TiledMap) else opened
+    settings = {} if arguments.precision is None else {"precision": arguments.precision}
+    model.pack(arguments.output, **settings)
+    size = Path(arguments.output).stat().st_size
+    print(f"{len(model)} clusters, {size} bytes -> {arguments.output}")
+
+
 def view(arguments: argparse.Namespace) -> None:
     """Show a map, and optionally its scans, in the browser."""
     import threading
@@ -192,13 +205,16 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 def info(arguments: argparse.Namespace) -> None:
     """Print the settings and the contents of a map, or what scan files hold and how they are read."""
+    from lardhm_torch.io.packed_files import is_packed
+
     if any(map(_is_scans, arguments.paths)):
         _info_of_scans(arguments)
         return
     if len(arguments.paths) > 1:
         raise ValueError(f"PATH must be one map or scan files; got {len(arguments.paths)} paths")
     (path,) = arguments.paths
-    rows = (_info_of_folder if Path(path).is_dir() else _info_of_file)(path)
+    is_tiled = Path(path).is_dir() and not is_packed(path)
+    rows = (_info_of_folder if is_tiled else _info_of_file)(path)
     if arguments.json:
         print(json.dumps(rows, indent=2))
         return
@@ -227,12 +243,13 @@ def _check_resolution(resolution: float) -> None:
 
 def _is_scans(name: str) -> bool:
     """Whether a path names scans and not a map."""
+    from lardhm_torch.io.packed_files import is_packed
     from lardhm_torch.io.scan_files import SCAN_SUFFIXES
     from lardhm_torch.tiles.manifest import MANIFEST_NAME
 
     path = Path(name)
     if path.is_dir():
-        return not (path / MANIFEST_NAME).is_file()
+        return not (path / MANIFEST_NAME).is_file() and not is_packed(path)
     return path.suffix.lower() in SCAN_SUFFIXES
 
 
@@ -245,18 +262,20 @@ def _info_of_scans(arguments: argparse.Namespace) -> None:
 
 def _info_of_file(path: str) -> dict[str, Any]:
     from lardhm_torch import LardHilbertMap
+    from lardhm_torch.io.packed_files import packet_files
     from lardhm_torch.queries.grids import map_bounds
 
     model = LardHilbertMap.load(path)
+    files = packet_files(path) if Path(path).is_dir() else [Path(path)]
     occupied = int(model.is_occupied.sum())
     rows: dict[str, Any] = {
-        "file size [bytes]": Path(path).stat().st_size,
+        "file size [bytes]": sum(file.stat().st_size for file in files),
         **model.settings,
         "dtype": str(model.centers.dtype).removeprefix("torch."),
         "clusters": len(model),
         "occupied clusters": occupied,
         "free clusters": len(model) - occupied,
-        "training points": int(model.counts.sum()),
+        "training points": "unknown" if model.is_packed else int(model.counts.sum()),
         "origin [m]": model.origin.tolist(),
     }
     if model.channel_layout:

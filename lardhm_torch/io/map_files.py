@@ -105,6 +105,7 @@ def check_settings(extra: Any) -> dict[str, Any]:
         )
     settings = {name: v for name, v in extra.items() if name not in CHANNEL_SETTINGS}
     version = settings.pop("format_version")
+    settings.pop("is_packed", None)
     if version != FORMAT_VERSION:
         cure = (
             "A newer map needs a newer lardhm_torch"

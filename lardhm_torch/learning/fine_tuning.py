@@ -12,13 +12,26 @@ from tqdm import tqdm
 
 from lardhm_torch import native
 from lardhm_torch.learning.changes import changes_map
-from lardhm_torch.learning.fitting import balance_classes, label_factors, logistic_loss
+from lardhm_torch.learning.fitting import (
+    balance_classes,
+    logistic_loss,
+    stratified_batches,
+)
 from lardhm_torch.learning.parameters import MapParameters
-from lardhm_torch.points import UNKNOWN, as_tensor, check_samples, to_map_frame
+from lardhm_torch.learning.tuning_steps import (
+    Batches,
+    Moving,
+    Plan,
+    Table,
+    from_rows,
+    to_rows,
+    tuning_steps,
+)
+from lardhm_torch.points import UNKNOWN, as_tensor, check_samples, in_morton_order, to_map_frame
 from lardhm_torch.sampling import Samples, seeded_generator
 
-WARM_UP_STEPS = 20  # number of steps of the learning rate warm-up
-MAX_BATCH = 1 << 15  # upper bound on the default batch size, to limit memory
+MAX_BATCH = 1 << 15  # upper bound on the default batch size
+GROUP_ROWS = 1 << 21  # number of points whose neighbors are in memory at a time
 State = dict[str, Any]  # tensors and plain values, for `torch.save` and `torch.load`
 EVALUATION_POINTS = 1 << 16  # number of points used to evaluate the loss after each epoch
 
@@ -42,11 +55,11 @@ def fine_tune(
     The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
     of centers are in units of the mean length-scale of their cluster, and the diagonals of factors
     are optimized as logarithms. Learning rates are therefore independent of the scene, and every
-    factor remains valid. Neighbors are searched anew in every step. Points are processed in batches,
-    so memory does not grow with their number. With ``hold_out``, a fraction of the rays is excluded
-    from training, and the parameters of the epoch with the smallest loss on them are kept. The
-    initial map is not a candidate, because `fit` has used those rays. If anything fails, the map is
-    unchanged.
+    factor remains valid. In each epoch the neighbors are searched once and the points passed several
+    times, in groups, so that memory for neighbors does not grow with the number of points. With
+    ``hold_out``, a fraction of the rays is excluded from training, and the parameters of the epoch
+    with the smallest loss on them are kept. The initial map is not a candidate, because `fit` has
+    used those rays. If anything fails, the map is unchanged.
 
     Args:
         model: a fitted map, changed in place.
@@ -69,46 +82,48 @@ def fine_tune(
         the first epoch and after each epoch.
 
     Raises:
-        ValueError: the map is empty, no parameter is to be optimized, the samples are invalid (see
-            `fit`), or the state belongs to a different map or config.
+        ValueError: the map is empty or packed, no parameter is to be optimized, the samples are
+            invalid (see `fit`), or the state belongs to a different map or config.
     """
     config = config or TuneConfig()
+    _check_task(model, config, resample is not None and ray_id is None)
+    samples = _check(model, points, labels, ray_id)
+    rng = seeded_generator(seed, "fine_tune", model.origin.device)
+    held_rays = _hold_out(samples, config.hold_out, rng)
+    train, evaluation = _divide(samples, held_rays)
+    run = TuningRun(model, config, rng, evaluation)
+    if state:
+        run.load(state)
+    for epoch in run.epochs(progress):
+        if resample and epoch:
+            fresh = resample(epoch)
+            fresh_samples = _check(model, fresh.points, fresh.labels, fresh.ray_id)
+            train = _divide(fresh_samples, held_rays)[0]
+        run.train(train)
+        if after_epoch:
+            after_epoch(run.state())
+    with torch.no_grad():
+        for parameter, value in zip(run.parameters_of_map(), from_rows(run.best), strict=True):
+            parameter.copy_(value)
+    return run.losses
+
+
+def _check_task(model: MapParameters, config: TuneConfig, rays_are_unknown: bool) -> None:
+    model.check_learns()
     if len(model) == 0:
         raise ValueError("model must be fitted before it is tuned; it is empty. Call fit first")
     if not (config.tune_weights or config.tune_centers or config.tune_scales):
         raise ValueError("config must leave weights, centers or scales to tune; it freezes all")
-    samples = _check(model, points, labels, ray_id)
-    if resample and config.hold_out and ray_id is None:
+    if config.hold_out and rays_are_unknown:
         raise ValueError(
             "ray_id must be given where held-out rays are to be sampled anew; got none"
         )
-    rng = seeded_generator(seed, "fine_tune", model.origin.device)
-    held_rays = _hold_out(samples, config.hold_out, rng)
-    train, evaluation = _divide(samples, held_rays)
-    run = TuningRun(model, config, rng)
-    run.load(state) if state else run.losses.append(run.evaluate(evaluation))
-    with tqdm(total=config.epochs, initial=run.epoch, disable=None if progress else True) as bar:
-        while run.epoch < config.epochs and not run.stalled():
-            if resample and run.epoch:
-                fresh = resample(run.epoch)
-                fresh_samples = _check(model, fresh.points, fresh.labels, fresh.ray_id)
-                train = _divide(fresh_samples, held_rays)[0]
-            run.train(train)
-            run.keep_best(run.evaluate(evaluation))
-            bar.set_postfix(loss=f"{run.losses[-1]:.4f}")
-            bar.update()
-            if after_epoch:
-                after_epoch(run.state())
-    with torch.no_grad():
-        for parameter, value in zip(run.parameters_of_map(), run.best, strict=True):
-            parameter.copy_(value)
-    return run.losses
 
 
 def _check(
     model: MapParameters, points: Tensor, labels: Tensor, ray_id: Tensor | None
 ) -> LabelledPoints:
-    """The occupied and free samples, checked.
+    """The occupied and free samples, checked, in the map's frame and in Morton order.
 
     Unknown points are left out: `fit` has made the map say 1/2 there, and tuning on them costs
     log-loss on held-out rays.
@@ -116,22 +131,24 @@ def _check(
     device = model.origin.device
     is_known = as_tensor(labels, "labels", device) != UNKNOWN
     points, labels = check_samples(points, labels, model.dim, device)
+    rays = torch.arange(len(points), device=device)
     if ray_id is not None:
         ray_id = torch.as_tensor(ray_id, device=device)
         if ray_id.shape != is_known.shape:
             raise ValueError(
                 f"ray_id must be ({len(is_known)},), one per point; got {tuple(ray_id.shape)}"
             )
-        ray_id = ray_id[is_known]
-    return LabelledPoints(points, labels, ray_id)
+        rays = ray_id[is_known]
+    dtype = model.centers.dtype
+    local = to_map_frame(points, model.origin, dtype)
+    return LabelledPoints(*in_morton_order(local, labels.to(dtype), rays))
 
 
 def _hold_out(samples: LabelledPoints, fraction: float, rng: torch.Generator) -> Tensor | None:
-    """IDs of a random fraction of the rays, or rows of points without ray IDs; None if none or all."""
+    """IDs of a random fraction of the rays; None if none or all."""
     if not fraction:
         return None
-    rays = samples.ray_id
-    ids = torch.arange(len(samples.labels), device=rng.device) if rays is None else rays.unique()
+    ids = samples.ray_id.unique()
     held = ids[torch.rand(len(ids), generator=rng, device=rng.device) < fraction]
     return held if 0 < len(held) < len(ids) else None
 
@@ -140,16 +157,14 @@ def _divide(
     samples: LabelledPoints, held_rays: Tensor | None
 ) -> tuple[LabelledPoints, LabelledPoints]:
     """Training points, and evaluation points: held-out points, or a subset of the training points."""
-    if held_rays is None:
-        train = evaluation = samples
-    else:
-        positions, labels, rays = samples
-        rays = torch.arange(len(labels), device=labels.device) if rays is None else rays
-        held = torch.isin(rays, held_rays)
-        train = LabelledPoints(positions[~held], labels[~held], None)
-        evaluation = LabelledPoints(positions[held], labels[held], None)
+    train = evaluation = samples
+    if held_rays is not None:
+        held = torch.isin(samples.ray_id, held_rays)
+        train, evaluation = (
+            LabelledPoints(*(column[rows] for column in samples)) for rows in (~held, held)
+        )
     every = -(-len(evaluation.labels) // EVALUATION_POINTS)
-    return train, LabelledPoints(evaluation.positions[::every], evaluation.labels[::every], None)
+    return train, LabelledPoints(*(column[::every] for column in evaluation))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +174,8 @@ class TuneConfig:
     ``l2`` and ``stiffness`` are relative to the summed loss of all points.
     """
 
-    epochs: int = 12
+    epochs: int = 4  # with new neighbors, and new samples where they are drawn anew
+    passes: int = 3  # over the samples of an epoch
     batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
     center_rate: float = 0.02  # per step, relative to the mean length-scale of the cluster
@@ -174,7 +190,7 @@ class TuneConfig:
     tune_scales: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size", "patience"):
+        for name in ("epochs", "passes", "batch_size", "patience"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be 1 or more; got {value}")
@@ -194,95 +210,110 @@ class TuneConfig:
 
 
 class LabelledPoints(NamedTuple):
-    """(N, D) world positions [m], (N,) labels, and (N,) ray IDs or None."""
+    """(N, D) positions in the map's frame [m], (N,) labels, and (N,) ray IDs."""
 
     positions: Tensor
     labels: Tensor
-    ray_id: Tensor | None
+    ray_id: Tensor
 
 
 class TuningRun:
-    """State of an optimization run. Adam optimizes offsets in units of the cluster size."""
+    """State of an optimization run. Offsets of parameters are in units of the cluster size."""
 
-    def __init__(self, model: MapParameters, config: TuneConfig, rng: torch.Generator) -> None:
-        self.model, self.config, self.rng = model, config, rng
-        self.epoch, self.step, self.losses = 0, 0, list[float]()
-        self._start_from([value.detach().clone() for value in self.parameters_of_map()])
+    def __init__(
+        self,
+        model: MapParameters,
+        config: TuneConfig,
+        rng: torch.Generator,
+        evaluation: LabelledPoints,
+    ) -> None:
+        self.model, self.config, self.rng, self.evaluation = model, config, rng, evaluation
+        self.epoch, self.step = 0, 0
+        self._start_from(to_rows(*(value.detach() for value in self.parameters_of_map())))
+        self.losses = [self.evaluate()]
 
-    def _start_from(self, start: list[Tensor]) -> None:
-        self.start = self.best = start
-        size = start[2].diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
-        size = self.model.covariance_scale**0.5 * size.clamp(min=self.model.min_lengthscale)
-        eye = torch.eye(self.model.dim, dtype=torch.bool, device=size.device)
-        self.units = [  # size: (M, 1) mean length-scale of the kernels [m]
-            torch.ones_like(start[0]),
-            size,
+    def _start_from(self, start: Tensor) -> None:
+        model, config, dim = self.model, self.config, self.model.dim
+        size = from_rows(start)[2].diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
+        size = model.covariance_scale**0.5 * size.clamp(min=model.min_lengthscale)
+        eye = torch.eye(dim, dtype=torch.bool, device=size.device)
+        unit = to_rows(  # size: (M, 1) mean length-scale of the kernels [m]
+            torch.ones_like(size[:, 0]),
+            size.expand(-1, dim),
             torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),
-        ]
-        config = self.config
-        moves = (config.tune_weights, config.tune_centers, config.tune_scales)
-        rates = (config.weight_rate, config.center_rate, config.scale_rate)
-        self.offsets = [
-            torch.zeros_like(value).requires_grad_(move)
-            for value, move in zip(start, moves, strict=True)
-        ]
-        groups = [
-            {"params": [offset], "lr": rate, "full_rate": rate}
-            for offset, rate in zip(self.offsets, rates, strict=True)
-            if offset.requires_grad
-        ]
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        )
+
+        def per_column(weight: float, center: float, scale: float) -> Tensor:
+            values = [weight] + dim * [center] + dim * (dim + 1) // 2 * [scale]
+            return torch.tensor(values, dtype=torch.float64, device=start.device)
+
+        rates = per_column(
+            config.weight_rate * config.tune_weights,
+            config.center_rate * config.tune_centers,
+            config.scale_rate * config.tune_scales,
+        )
+        penalties = per_column(config.l2, config.stiffness, config.stiffness)
+        self.best, self.table = start, Table(start, unit, rates, penalties, model.kernel)
+        self.moving = Moving(*(torch.zeros_like(start) for _ in range(3)))
 
     def parameters_of_map(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The parameters of the map, in the order of the offsets."""
+        """Weights, centers and raw factors of the map."""
         return self.model.weights, self.model.centers, self.model.raw_scale_tril
 
-    def current(self) -> list[Tensor]:
-        """Weights, centers and raw factors with the current offsets applied."""
-        rows = zip(self.start, self.units, self.offsets, strict=True)
-        return [start + unit * offset for start, unit, offset in rows]
-
-    def log_odds(self, points: Tensor, weights: Tensor, centers: Tensor, raw: Tensor) -> Tensor:
-        """(B, D) world positions [m] -> (B,) log-odds of the map with the given parameters."""
-        local = to_map_frame(points, self.model.origin, centers.dtype)
-        return native.occupancy(local, centers, raw, weights, self.model.kernel, probability=False)
+    def epochs(self, progress: bool) -> Iterator[int]:
+        """Numbers of the epochs to train; the loss is evaluated after each of them."""
+        config, left = self.config, None if progress else True
+        with tqdm(total=config.epochs, initial=self.epoch, disable=left) as bar:
+            while self.epoch < config.epochs and not self.stalled():
+                yield self.epoch
+                bar.set_postfix(loss=f"{self.losses[-1]:.4f}")
+                bar.update()
 
     def train(self, samples: LabelledPoints) -> None:
-        """Train for one epoch over the points."""
+        """Train for one epoch over the points, and keep the parameters if they are the best."""
         config, count = self.config, len(samples.labels)
-        batch_size = config.batch_size or min(MAX_BATCH, max(1024, count // 64))
-        factors = label_factors(samples.labels, config.occupied_share).to(self.start[0])
-        steps_left = (config.epochs - self.epoch) * -(-count // batch_size)
-        total_steps = self.step + steps_left
-        for rows in batches(count, batch_size, self.rng):
-            weights, centers, raw = self.current()
-            labels = samples.labels[rows].to(weights.dtype)
-            answer = self.log_odds(samples.positions[rows], weights, centers, raw)
-            loss = logistic_loss(answer, labels, factors[(2 * labels).long()]) / len(rows)
-            moved = sum(offset.square().sum() for offset in self.offsets[1:])
-            penalty = config.l2 * weights.square().sum() + config.stiffness * moved
-            self.optimizer.zero_grad()
-            (loss + penalty / count).backward()
-            for group in self.optimizer.param_groups:
-                group["lr"] = group["full_rate"] * _rate_fraction(self.step, total_steps)
-            self.optimizer.step()
-            self.step += 1
+        groups = -(-count // GROUP_ROWS)
+        wanted = config.batch_size or min(MAX_BATCH, max(1024, count // 64))
+        batch_size = -(-count // (groups * -(-count // (groups * wanted))))
+        steps = [-(-len(range(group, count, groups)) // batch_size) for group in range(groups)]
+        total = self.step + (config.epochs - self.epoch) * config.passes * sum(steps)
+        plan = Plan(count, batch_size, total)
+        factors = balance_classes(samples.labels, config.occupied_share)
+        for group, steps_per_pass in enumerate(steps):
+            columns = (samples.positions, samples.labels, factors)
+            points, labels, weights = (column[group::groups].contiguous() for column in columns)
+            near = self._neighbors(points)
+            *batches, near = stratified_batches(
+                (points, labels, weights, near), batch_size, self.rng
+            )
+            for _ in range(config.passes):
+                self.moving = tuning_steps(
+                    Batches(*batches), near, self.table, self.moving, self.step, plan
+                )
+                self.step += steps_per_pass
         self.epoch += 1
+        self._keep_best(self.evaluate())
+
+    def _neighbors(self, points: Tensor) -> Tensor:
+        _, centers, raw = self.table.parameters(self.moving.offsets)
+        index = native.build_index(centers, self.model.num_neighbors)
+        return native.nearest_features(points, centers, raw, self.model.kernel, index)[0]
 
     @torch.no_grad()
-    def evaluate(self, samples: LabelledPoints) -> float:
-        """Mean balanced log-loss on the points."""
-        current = self.current()
-        chunks = samples.positions.split(MAX_BATCH)
-        answer = torch.cat([self.log_odds(chunk, *current) for chunk in chunks])
-        labels = samples.labels.to(answer.dtype)
+    def evaluate(self) -> float:
+        """Mean balanced log-loss on the evaluation points."""
+        points, labels, _ = self.evaluation
+        weights, centers, raw = self.table.parameters(self.moving.offsets)
+        answer = native.occupancy(
+            points, centers, raw, weights, self.model.kernel, probability=False
+        )
         return float(logistic_loss(answer, labels, balance_classes(labels))) / len(answer)
 
-    def keep_best(self, loss: float) -> None:
+    def _keep_best(self, loss: float) -> None:
         """Record the loss of the epoch, and its parameters if the loss is the smallest so far."""
         self.losses.append(loss)
         if not self.config.hold_out or loss <= min(self.losses[1:]):
-            self.best = [value.detach().clone() for value in self.current()]
+            self.best = self.table.start + self.table.unit * self.moving.offsets
 
     def stalled(self) -> bool:
         """Whether the loss has not improved for ``patience`` epochs."""
@@ -296,10 +327,9 @@ class TuningRun:
             "epoch": self.epoch,
             "step": self.step,
             "losses": list(self.losses),
-            "start": self.start,
-            "offsets": [offset.detach().clone() for offset in self.offsets],
+            "start": self.table.start,
+            **self.moving._asdict(),
             "best": self.best,
-            "optimizer": self.optimizer.state_dict(),
             "rng": self.rng.get_state(),
         }
 
@@ -307,42 +337,17 @@ class TuningRun:
         """Resume from a state."""
         if state["config"] != asdict(self.config):
             raise ValueError(f"state must be of this config; got one of {state['config']}")
-        shapes = [value.shape for value in state["start"]]
-        if shapes != [value.shape for value in self.start]:
+        start = self.table.start
+        if state["start"].shape != start.shape:
             raise ValueError(
-                f"state must be of a map with {len(self.start[0])} clusters; got {shapes[0][0]}"
+                f"state must be of a map with {len(start)} clusters; got {len(state['start'])}"
             )
-        self._start_from(
-            [value.to(own) for value, own in zip(state["start"], self.start, strict=True)]
-        )
-        with torch.no_grad():
-            for offset, value in zip(self.offsets, state["offsets"], strict=True):
-                offset.copy_(value)
+        self._start_from(state["start"].to(start))
+        self.moving = Moving(*(state[name].to(start) for name in Moving._fields))
         self.epoch, self.step, self.losses = state["epoch"], state["step"], list(state["losses"])
-        self.best = [value.to(own) for value, own in zip(state["best"], self.start, strict=True)]
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.best = state["best"].to(start)
         self.rng.set_state(state["rng"])
 
 
 def _last_best(losses: list[float]) -> int:
     return max((row for row, loss in enumerate(losses) if loss <= min(losses)), default=0)
-
-
-def batches(count: int, batch_size: int, rng: torch.Generator) -> Iterator[Tensor]:
-    """Yield stratified batches that together contain every row once.
-
-    The rows are divided into runs of consecutive rows, and each batch contains one row of every run.
-    Samples are ordered by class and ray, so each batch represents both classes and the whole scene in
-    proportion. No index tensor of the length of the data is created.
-    """
-    steps = -(-count // batch_size)
-    first = torch.arange(0, count, steps, device=rng.device)  # first row of each run
-    shift = torch.randint(steps, first.shape, generator=rng, device=rng.device)
-    for turn in torch.randperm(steps, generator=rng, device=rng.device):
-        rows = first + (shift + turn) % steps
-        yield rows[rows < count]
-
-
-def _rate_fraction(step: int, total_steps: int) -> float:
-    """Fraction of the full learning rate: a short warm-up, and a linear decay to 0."""
-    return min(1.0, (step + 1) / WARM_UP_STEPS) * max(0.0, 1 - step / total_steps)

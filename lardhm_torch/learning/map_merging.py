@@ -175,7 +175,7 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         A new map, in the frame of the first.
 
     Raises:
-        ValueError: the settings differ, or a channel has different numbers of values.
+        ValueError: the settings differ, a map is packed, or a channel has different numbers of values.
 
     Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, applied to two maps.
     """
@@ -183,6 +183,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         raise ValueError(
             f"both maps must have the same settings; got {first.settings} and {second.settings}"
         )
+    first.check_learns()
+    second.check_learns()
     joined = copy.deepcopy(first)
     if len(second) == 0:
         return joined

@@ -66,6 +66,7 @@ class MapParameters(nn.Module):
         self.num_neighbors = num_neighbors
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
+        self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
         with normal_tensors():
             self._register_empty(dim, device, dtype)
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
@@ -107,6 +108,13 @@ class MapParameters(nn.Module):
         for name, tensor in buffers.items():
             self.register_buffer(name, tensor)
         self.register_parameter("class_weights", None)
+
+    @classmethod
+    def from_state(cls: type[AnyMap], state: dict[str, Any]) -> AnyMap:
+        """A map with the settings and tensors of a state dict."""
+        model = cls(**map_files.map_settings(state), dtype=state["centers"].dtype)
+        model.load_state_dict(state)
+        return model
 
     def __len__(self) -> int:
         """Number of clusters M."""
@@ -169,12 +177,23 @@ class MapParameters(nn.Module):
     def get_extra_state(self) -> dict[str, Any]:
         """Format version and settings, stored in the state dict with the tensors."""
         state = {"format_version": map_files.FORMAT_VERSION, **self.settings}
+        if self.is_packed:
+            state["is_packed"] = True
         if self.channel_layout:
             state |= {"channels": self.channel_layout, "class_scale": self.class_scale}
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Do nothing: `make_room` has already checked that the settings agree."""
+        """Whether the map is packed; `make_room` has already checked that the settings agree."""
+        self.is_packed = bool(state.get("is_packed", False))
+
+    def check_learns(self) -> None:
+        """Raise a ValueError if the map is packed: it has lost what learning continues from."""
+        if self.is_packed:
+            raise ValueError(
+                "model must hold what it learned from; a packed map answers but does not learn. "
+                "Load the file written by save, or make a new map"
+            )
 
     def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
         """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""

@@ -310,6 +310,11 @@ def _register() -> None:
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
         return tuple(torch.empty_like(weights) for _ in range(3))
 
+    @library.register_fake("lardhm::tuning_steps")
+    def _(points: Tensor, indices: Tensor, labels: Tensor, factors: Tensor, start: Tensor,
+          *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
+        return tuple(torch.empty_like(start) for _ in range(3))
+
     @library.register_fake("lardhm::nearest_clusters")
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.int32)

@@ -26,7 +26,7 @@ FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
 # Sources that are compiled together, the longest job first. Torch's headers take a second a unit: the
 # last two do without.
 UNITS = (
-    ("query", "kmeans", "gradients", "descent", "mixture"),
+    ("query", "kmeans", "gradients", "descent", "mixture", "tuning"),
     ("raycast", "update", "pooling", "evidence", "cells", "marching", "ridge", "threads"),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),

@@ -150,13 +150,6 @@ void check_descent(const Tensor& indices, const Tensor& values, const Tensor& la
   check(entries == 0 || int64_t(largest) < count, "index out of range");
 }
 
-Tensor copy_of(const Tensor& tensor) {
-  const Tensor from = tidy(tensor), copy = torch::stable::new_empty(tensor, tensor.sizes());
-  const int64_t bytes = from.scalar_type() == ScalarType::Double ? 8 : 4;
-  std::memcpy(copy.mutable_data_ptr(), from.const_data_ptr(), from.numel() * bytes);
-  return copy;
-}
-
 State descent(const Tensor& given_indices, const Tensor& given_values, const Tensor& given_labels,
               const Tensor& given_factors, const Tensor& weights, const Tensor& mean,
               const Tensor& square, int64_t num_points, int64_t batch_size, int64_t first_step,

@@ -7,6 +7,7 @@
 #include <torch/csrc/stable/tensor.h>
 
 #include <cstdint>
+#include <cstring>
 #include <stdexcept>
 #include <string>
 #include <type_traits>
@@ -25,6 +26,14 @@ inline void check(bool holds, const char* rule) {
 }
 
 inline Tensor tidy(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
+
+// A contiguous copy of a float32 or float64 tensor.
+inline Tensor copy_of(const Tensor& tensor) {
+  const Tensor from = tidy(tensor), copy = torch::stable::new_empty(tensor, tensor.sizes());
+  const int64_t bytes = from.scalar_type() == ScalarType::Double ? 8 : 4;
+  std::memcpy(copy.mutable_data_ptr(), from.const_data_ptr(), from.numel() * bytes);
+  return copy;
+}
 
 template <class T>
 const T* in(const Tensor& tensor) {

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.io.packed_files import is_packed
 from lardhm_torch.learning import posterior
 from lardhm_torch.points import check_axes, check_points
 from lardhm_torch.tiles.blocks import lattice_parts, row_numbers, rows_by_number
@@ -288,10 +289,11 @@ class TiledMap:
 
 
 def open_map(path: Folder) -> LardHilbertMap | TiledMap:
-    """The map of a file, or the tiled map of a folder.
+    """The map of a file or of a folder of packets, or the tiled map of a folder.
 
     Raises:
         FileNotFoundError: there is no such file, or the folder has no manifest.
         ValueError: the file or the manifest is damaged.
     """
-    return TiledMap.open(path) if Path(path).is_dir() else LardHilbertMap.load(path)
+    is_one_map = is_packed(path) or not Path(path).is_dir()
+    return LardHilbertMap.load(path) if is_one_map else TiledMap.open(path)

@@ -1,0 +1,419 @@
+// Fine-tuning over kept neighbors, batch after batch: forward, backward and Adam in one pass.
+//
+// The same arithmetic as `tuning_steps.plain_steps`. A point's neighbors are the lanes of a register.
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "kernel.h"
+#include "tensors.h"
+
+namespace lardhm {
+namespace tuning {
+
+// Columns of the table of parameters: weight, center, lower factor row by row.
+template <int D>
+constexpr int kColumns = 1 + D + D * (D + 1) / 2;
+
+// A cluster in the memory of the gradient: center, 1 / diagonal, below the diagonal, weight.
+template <int D>
+struct Record {
+  static constexpr int inverse = D, below = 2 * D, weight = below + D * (D - 1) / 2;
+  static constexpr int fields = weight + 1, stride = 16;  // stride: of gradients, too
+};
+
+// What stays the same over a call. Names as in `tuning_steps.Plan`.
+struct Plan {
+  const double *rates, *penalties;  // by column
+  int64_t num_points, batch_size, first_step, total_steps, warm_up;
+  Scaling scaling;
+  bool fades;
+  double fraction(int64_t step) const {
+    return std::min(1.0, double(step + 1) / double(warm_up)) *
+           std::max(0.0, 1 - double(step) / double(total_steps));
+  }
+};
+
+// What stays the same over a step: factors on the running mean and on the root of the running mean square,
+// and of the penalty, by column.
+template <class T>
+struct Step {
+  T rates[16], penalties[16], square_scale;
+
+  Step(const Plan& plan, int64_t step, int columns)
+      : square_scale(T(1 / std::sqrt(1 - std::pow(0.99, double(step + 1))))) {
+    const double mean_bias = 1 - std::pow(0.9, double(step + 1));
+    for (int g = 0; g < columns; ++g) {
+      rates[g] = T(plan.rates[g] * plan.fraction(step) / mean_bias);
+      penalties[g] = T(2 * plan.penalties[g] / double(plan.num_points));
+    }
+  }
+};
+
+template <class T>
+struct Samples {
+  const T* points;
+  const int32_t* indices;
+  const T *labels, *factors;
+  int64_t k;
+};
+
+// Offsets, running means and mean squares of the gradient, all (M, G), and what they are added to.
+template <class T>
+struct Table {
+  const T *start, *unit;
+  T *offsets, *mean, *square;
+  int64_t count;
+};
+
+// Lanes of a (0 .. W - 1) and b (W .. 2 W - 1), picked by number.
+template <class T>
+inline typename Simd<T>::V shuffle(typename Simd<T>::V a, typename Simd<T>::V b,
+                                   typename Simd<T>::I lanes) {
+#if defined(__GNUC__) && !defined(__clang__)
+  return __builtin_shuffle(a, b, lanes);
+#else
+  typename Simd<T>::V picked;
+  for (int i = 0; i < Simd<T>::W; ++i)
+    picked[i] = lanes[i] < Simd<T>::W ? a[lanes[i]] : b[lanes[i] - Simd<T>::W];
+  return picked;
+#endif
+}
+
+// Lane i of register j becomes lane j of register i, for W registers: in each stage, blocks of 1, 2, 4, ...
+// lanes change places.
+template <class T, int Stage = 1>
+inline void transpose(typename Simd<T>::V* v) {
+  using V = typename Simd<T>::V;
+  using I = typename Simd<T>::I;
+  constexpr int W = Simd<T>::W;
+  if constexpr (Stage < W) {
+    I first, second;
+    for (int lane = 0; lane < W; ++lane) {
+      first[lane] = lane & Stage ? W + lane - Stage : lane;
+      second[lane] = lane & Stage ? W + lane : lane + Stage;
+    }
+    for (int i = 0; i < W; ++i) {
+      if (i & Stage) continue;
+      const V a = v[i], b = v[i + Stage];
+      v[i] = shuffle<T>(a, b, first);
+      v[i + Stage] = shuffle<T>(a, b, second);
+    }
+    transpose<T, 2 * Stage>(v);
+  }
+}
+
+// Fields of a point's neighbors, then their gradients: a row of lanes each.
+template <class T, int D>
+struct Lanes {
+  using V = typename Simd<T>::V;
+  static constexpr int W = Simd<T>::W;
+  int64_t k, rows;
+  std::vector<V> memory;
+  V *fields, *grads, *squared, *kernel, *z;
+  std::vector<V> exists;  // 1 in lanes of neighbors
+
+  explicit Lanes(int64_t k_) : k(k_), rows((k_ + W - 1) / W) {
+    constexpr int kFields = Record<D>::fields, kGrads = kColumns<D>;
+    memory.assign(rows * (kFields + kGrads + 2 + D), V{});
+    fields = memory.data();
+    grads = fields + rows * kFields;
+    squared = grads + rows * kGrads;
+    kernel = squared + rows;
+    z = kernel + rows;
+    exists.assign(rows, V{});
+    for (int64_t j = 0; j < k; ++j) lane(exists.data(), j) = 1;
+  }
+
+  static T& lane(V* row, int64_t j) { return reinterpret_cast<T*>(row)[j]; }
+
+  void read(const int32_t* index, const T* records) {
+    V block[W];
+    for (int64_t r = 0; r < rows; ++r)
+      for (int c = 0; c < Record<D>::fields; c += W) {
+        for (int j = 0; j < W; ++j) {
+          const int64_t neighbor = std::min<int64_t>(r * W + j, k - 1);
+          block[j] = load<V>(records + int64_t(index[neighbor]) * Record<D>::stride + c);
+        }
+        transpose<T>(block);
+        for (int f = c; f < std::min(Record<D>::fields, c + W); ++f)
+          fields[f * rows + r] = block[f - c];
+      }
+  }
+
+  void add_to(const int32_t* index, T* sums) const {
+    V block[W];
+    for (int64_t r = 0; r < rows; ++r)
+      for (int c = 0; c < kColumns<D>; c += W) {
+        for (int g = 0; g < W; ++g)
+          block[g] = c + g < kColumns<D> ? grads[(c + g) * rows + r] : V{};
+        transpose<T>(block);
+        for (int64_t j = r * W; j < std::min(k, (r + 1) * W); ++j) {
+          T* sum = sums + int64_t(index[j]) * Record<D>::stride + c;
+          const V total = load<V>(sum) + block[j - r * W];
+          std::memcpy(sum, &total, sizeof(V));
+        }
+      }
+  }
+
+  // Whitened offsets, kernel values and squared distances; returns the largest of the latter.
+  T forward(const T* x) {
+    V most = {};
+    for (int64_t r = 0; r < rows; ++r) {
+      V offset[D], zr[D], shape[Record<D>::fields - D], sum = {};
+      for (int d = 0; d < D; ++d) offset[d] = x[d] - fields[d * rows + r];
+      for (int f = D; f < Record<D>::fields; ++f) shape[f - D] = fields[f * rows + r];
+      for (int d = 0; d < D; ++d) sum += offset[d] * offset[d];
+      whiten(offset, shape, zr);
+      squared[r] = sum * exists[r];
+      for (int d = 0; d < D; ++d) z[d * rows + r] = zr[d];
+      kernel[r] = kernel_of<T, D>(zr) * exists[r];
+      most = squared[r] > most ? squared[r] : most;
+    }
+    return -smallest_lane<T>(-most);
+  }
+
+  static void whiten(const V* offset, const V* shape, V* zr) {
+    const V* below = shape + D;
+    zr[0] = offset[0] * shape[0];
+    zr[1] = (offset[1] - zr[0] * below[0]) * shape[1];
+    if constexpr (D == 3) zr[2] = (offset[2] - zr[0] * below[1] - zr[1] * below[2]) * shape[2];
+  }
+
+  T log_odds(T fading, bool fades) const {
+    V sum = {};
+    for (int64_t r = 0; r < rows; ++r) {
+      const V fade = fades ? fade_of<T>(squared[r] * fading) : V{} + T(1);
+      sum += kernel[r] * fade * fields[Record<D>::weight * rows + r];
+    }
+    return sum_lanes<T>(sum);
+  }
+
+  // Gradients of weight, center and factor; `pull` is that of the log-odds.
+  void backward(const T* x, T pull, T farthest, T fading, bool fades) {
+    V reach = {}, tied = {};
+    for (int64_t r = 0; r < rows; ++r) {
+      const V t = squared[r] * fading, weight = fields[Record<D>::weight * rows + r];
+      const V value = kernel[r] * (fades ? fade_of<T>(t) : V{} + T(1));
+      grads[r] = pull * value;
+      const V share = pull * weight * value;
+      const V slope = fades ? pull * weight * kernel[r] * fade_slope<T>(t) * fading : V{};
+      reach -= slope * t;
+      tied += squared[r] >= farthest ? exists[r] : V{};
+      shape_gradient(x, r, share, T(2) * slope);
+    }
+    if (!fades) return;
+    const T pulled = T(2) * sum_lanes<T>(reach) / sum_lanes<T>(tied);
+    for (int64_t r = 0; r < rows; ++r) {
+      const V at_it = squared[r] >= farthest ? exists[r] * pulled : V{};
+      for (int d = 0; d < D; ++d)
+        grads[(1 + d) * rows + r] += at_it * (fields[d * rows + r] - x[d]);
+    }
+  }
+
+  // y = inv(L)^T z; d log_odds / dc = w phi y, by L: w phi y z^T; the fade adds 2 slope (c - x).
+  void shape_gradient(const T* x, int64_t r, V share, V slope) {
+    const auto field = [&](int f) { return fields[f * rows + r]; };
+    V y[D], zr[D];
+    for (int d = 0; d < D; ++d) zr[d] = z[d * rows + r];
+    y[D - 1] = share * zr[D - 1] * field(Record<D>::inverse + D - 1);
+    if constexpr (D == 3)
+      y[1] = (share * zr[1] - y[2] * field(Record<D>::below + 2)) * field(Record<D>::inverse + 1);
+    y[0] = share * zr[0] - y[1] * field(Record<D>::below);
+    if constexpr (D == 3) y[0] -= y[2] * field(Record<D>::below + 1);
+    y[0] *= field(Record<D>::inverse);
+    for (int d = 0; d < D; ++d)
+      grads[(1 + d) * rows + r] = y[d] + slope * (field(d) - x[d]);
+    V* factor = grads + (1 + D) * rows + r;
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j, factor += rows) *factor = y[i] * zr[j];
+  }
+};
+
+// Adds the gradients of the mean loss of the rows begin .. end, of a batch of `size`, to the sums.
+template <class T, int D>
+void add_gradients(const Samples<T>& samples, int64_t begin, int64_t end, int64_t size, bool fades,
+                   const T* records, T* sums) {
+  Lanes<T, D> lanes(samples.k);
+  const T share = T(1) / T(size);
+  for (int64_t row = begin; row < end; ++row) {
+    const T* x = samples.points + row * D;
+    const int32_t* index = samples.indices + row * samples.k;
+    lanes.read(index, records);
+    const T farthest = lanes.forward(x);
+    const T fading = T(1) / (farthest + std::numeric_limits<T>::min());
+    const T log_odds = lanes.log_odds(fading, fades);
+    const T probability = sigmoid<T>(typename Simd<T>::V{} + log_odds)[0];
+    const T pull = samples.factors[row] * share * (probability - samples.labels[row]);
+    lanes.backward(x, pull, farthest, fading, fades);
+    lanes.add_to(index, sums);
+  }
+}
+
+// The cluster's parameters with the current offsets applied.
+template <class T, int D>
+void write_record(const Table<T>& table, const Scaling& scaling, int64_t m, T* record) {
+  constexpr int G = kColumns<D>;
+  T value[G];
+  for (int g = 0; g < G; ++g)
+    value[g] = table.start[m * G + g] + table.unit[m * G + g] * table.offsets[m * G + g];
+  const T scale = T(std::sqrt(scaling.covariance_scale)), floor = T(scaling.min_lengthscale);
+  for (int d = 0; d < D; ++d) record[d] = value[1 + d];
+  int below = Record<D>::below;
+  const T* factor = value + 1 + D;
+  for (int i = 0; i < D; ++i)
+    for (int j = 0; j <= i; ++j, ++factor) {
+      if (i == j)
+        record[Record<D>::inverse + i] = 1 / (scale * std::max(std::exp(*factor), floor));
+      else
+        record[below++] = scale * *factor;
+    }
+  record[Record<D>::weight] = value[0];
+}
+
+// One step of Adam on a cluster, from the gradient by the kernel's parameters.
+template <class T, int D>
+void step_cluster(const Table<T>& table, const Step<T>& step, const Scaling& scaling, int64_t m,
+                  T* grad) {
+  constexpr int G = kColumns<D>;
+  const T scale = T(std::sqrt(scaling.covariance_scale)), floor = T(scaling.min_lengthscale);
+  for (int i = 0, g = 1 + D; i < D; ++i)
+    for (int j = 0; j <= i; ++j, ++g) {
+      const int64_t at = m * G + g;
+      if (i != j) {
+        grad[g] *= scale;
+        continue;
+      }
+      const T size = std::exp(table.start[at] + table.unit[at] * table.offsets[at]);
+      grad[g] *= size >= floor ? scale * size : T(0);
+    }
+  for (int g = 0; g < G; ++g) {
+    const int64_t at = m * G + g;
+    const T offset = table.offsets[at];
+    const T unit = table.unit[at];
+    const T penalized = g == 0 ? (table.start[at] + unit * offset) * unit : offset;
+    const T slope = unit * grad[g] + step.penalties[g] * penalized;
+    table.mean[at] = T(0.9) * table.mean[at] + T(0.1) * slope;
+    table.square[at] = T(0.99) * table.square[at] + T(0.01) * slope * slope;
+    const T size = std::sqrt(table.square[at]) * step.square_scale + T(1e-8);
+    table.offsets[at] = offset - step.rates[g] * table.mean[at] / size;
+  }
+}
+
+template <class T, int D>
+void run_batches(const Samples<T>& samples, int64_t n, const Table<T>& table, const Plan& plan) {
+  constexpr int64_t kGrain = 1024, kStride = Record<D>::stride;
+  const int64_t count = table.count, parts = num_threads();
+  AlignedArray<T> records;
+  records.allocate(count * kStride);
+  std::vector<T> sums(parts * count * kStride);
+  const auto clusters = [&](const auto& work) {
+    run_tasks((count + kGrain - 1) / kGrain, [&](int64_t task) {
+      const int64_t end = std::min(count, (task + 1) * kGrain);
+      for (int64_t m = task * kGrain; m < end; ++m) work(m);
+    });
+  };
+  clusters([&](int64_t m) { write_record<T, D>(table, plan.scaling, m, records.data + m * kStride); });
+  int64_t step = plan.first_step;
+  for (int64_t begin = 0; begin < n; begin += plan.batch_size, ++step) {
+    const int64_t size = std::min(n - begin, plan.batch_size);
+    run_tasks(parts, [&](int64_t part) {
+      add_gradients<T, D>(samples, begin + size * part / parts, begin + size * (part + 1) / parts,
+                          size, plan.fades, records.data, sums.data() + part * count * kStride);
+    });
+    const Step<T> now(plan, step, kColumns<D>);
+    clusters([&](int64_t m) {
+      T grad[kStride] = {};
+      for (int64_t part = 0; part < parts; ++part) {
+        T* sum = sums.data() + (part * count + m) * kStride;
+        for (int g = 0; g < kStride; ++g) grad[g] += sum[g];
+        std::fill(sum, sum + kStride, T(0));
+      }
+      step_cluster<T, D>(table, now, plan.scaling, m, grad);
+      write_record<T, D>(table, plan.scaling, m, records.data + m * kStride);
+    });
+  }
+}
+
+using State = std::tuple<Tensor, Tensor, Tensor>;
+
+void check_state(const Tensor& points, const Tensor& start, std::initializer_list<const Tensor*> like) {
+  const int64_t dim = points.size(1);
+  check(start.dim() == 2 && start.size(1) == 1 + dim + dim * (dim + 1) / 2 &&
+            start.scalar_type() == points.scalar_type(),
+        "start must be (M, 1 + D + D (D + 1) / 2), of the dtype of the points");
+  for (const Tensor* tensor : like)
+    check(tensor->dim() == 2 && tensor->size(0) == start.size(0) &&
+              tensor->size(1) == start.size(1) && tensor->scalar_type() == start.scalar_type(),
+          "unit, offsets, mean and square must be like start");
+}
+
+void check_samples(const Tensor& points, const Tensor& indices, const Tensor& labels,
+                   const Tensor& factors, int64_t count) {
+  const int64_t n = points.size(0);
+  check(indices.dim() == 2 && indices.size(0) == n && indices.scalar_type() == ScalarType::Int &&
+            indices.size(1) >= 1,
+        "indices must be (N, K) int32, K at least 1");
+  check(labels.numel() == n && factors.numel() == n &&
+            labels.scalar_type() == points.scalar_type() &&
+            factors.scalar_type() == points.scalar_type(),
+        "labels and factors must be (N,), of the dtype of the points");
+  const int32_t* index = in<int32_t>(indices);
+  const int64_t entries = indices.numel();
+  uint32_t largest = 0;
+  for (int64_t i = 0; i < entries; ++i) largest = std::max(largest, uint32_t(index[i]));
+  check(entries == 0 || int64_t(largest) < count, "index out of range");
+}
+
+State tuning_steps(const Tensor& given_points, const Tensor& given_indices,
+                   const Tensor& given_labels, const Tensor& given_factors,
+                   const Tensor& given_start, const Tensor& given_unit, const Tensor& offsets,
+                   const Tensor& mean, const Tensor& square, const Tensor& given_rates,
+                   const Tensor& given_penalties, int64_t num_points, int64_t batch_size,
+                   int64_t first_step, int64_t total_steps, int64_t warm_up,
+                   double covariance_scale, double min_lengthscale) {
+  const Tensor points = tidy(given_points), indices = tidy(given_indices);
+  const Tensor labels = tidy(given_labels), factors = tidy(given_factors);
+  const Tensor start = tidy(given_start), unit = tidy(given_unit);
+  const Tensor rates = tidy(given_rates), penalties = tidy(given_penalties);
+  check(batch_size >= 1 && warm_up >= 1, "batch_size and warm_up must be 1 or more");
+  check(points.dim() == 2 && (points.size(1) == 2 || points.size(1) == 3),
+        "points must be (N, 2) or (N, 3)");
+  check_state(points, start, {&unit, &offsets, &mean, &square});
+  check_samples(points, indices, labels, factors, start.size(0));
+  check(rates.scalar_type() == ScalarType::Double && penalties.scalar_type() == ScalarType::Double &&
+            rates.numel() == start.size(1) && penalties.numel() == start.size(1),
+        "rates and penalties must be float64, one for each column");
+  const State state{copy_of(offsets), copy_of(mean), copy_of(square)};
+  const int64_t k = indices.size(1), count = start.size(0);
+  const Plan plan{in<double>(rates), in<double>(penalties), num_points, batch_size, first_step,
+                  total_steps, warm_up, {covariance_scale, min_lengthscale}, k > 1 && k < count};
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    const Samples<T> samples{in<T>(points), in<int32_t>(indices), in<T>(labels), in<T>(factors), k};
+    const Table<T> table{in<T>(start), in<T>(unit), out<T>(std::get<0>(state)),
+                         out<T>(std::get<1>(state)), out<T>(std::get<2>(state)), count};
+    run_batches<T, dim()>(samples, points.size(0), table, plan);
+    return 0;
+  });
+  return state;
+}
+
+}  // namespace tuning
+}  // namespace lardhm
+
+STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
+  m.def(
+      "tuning_steps(Tensor points, Tensor indices, Tensor labels, Tensor factors, Tensor start, "
+      "Tensor unit, Tensor offsets, Tensor mean, Tensor square, Tensor rates, Tensor penalties, "
+      "int num_points, int batch_size, int first_step, int total_steps, int warm_up, "
+      "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor, Tensor)");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
+  m.impl("tuning_steps", TORCH_BOX(&lardhm::tuning::tuning_steps));
+}
