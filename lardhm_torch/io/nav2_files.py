@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,6 +28,30 @@ OCCUPIED, UNKNOWN, FREE = 0, 205, 254  # shades of map_saver: probability is (25
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # 205 is probability .19608: between both
 COARSE = 8  # cells along an edge of a lattice cell, so a block has 64
 UNSEEN = np.nan  # log-odds of unknown cells
+
+
+class GroundGrid(NamedTuple):
+    """A map seen from above.
+
+    ``log_odds`` (nx, ny) float32, NaN where unknown; cell (0, 0) has its lower corner at ``first``
+    (2,), in whole cells of ``resolution`` [m].
+    """
+
+    log_odds: np.ndarray
+    first: np.ndarray
+    resolution: float
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """(x, y) of the lower corner of the first cell [m]."""
+        x, y = (round(float(i) * self.resolution, 9) for i in self.first)
+        return x, y
+
+    def percent(self) -> np.ndarray:
+        """(ny, nx) int8 values of nav_msgs/OccupancyGrid: -1 unknown, else probability in percent."""
+        probability = 1 / (1 + np.exp(-np.nan_to_num(self.log_odds.T)))
+        values = np.round(100 * probability)
+        return np.where(np.isnan(self.log_odds.T), -1, values).astype(np.int8)
 
 
 def save_nav2(
@@ -71,15 +96,17 @@ def save_nav2(
         raise ValueError(f"path must end in .yaml or .yml for Nav2; got {target.name!r}")
     if mode not in MODES:
         raise ValueError(f"mode must be one of {', '.join(MODES)}; got {mode!r}")
-    levels = _levels(model, heights, resolution)
-    log_odds, first = _ground_log_odds(model, resolution, levels, bounds)
-    if bounds is None:
-        log_odds, first = _cropped(log_odds, first)
+    found = ground_grid(model, resolution, heights=heights, bounds=bounds)
+    if found.log_odds.size == 0:
+        raise ValueError(
+            "the map must have known cells for Nav2; none is, or none between the heights"
+        )
+    log_odds = found.log_odds
     image = target.with_suffix(".pgm" if mode == "trinary" else ".png")
     write = _write_trinary if mode == "trinary" else _write_scale
     with replaced_file(image) as partial:
         write(log_odds.T[::-1], partial)
-    corner = ", ".join(repr(round(float(i) * resolution, 9)) for i in first)
+    corner = ", ".join(map(repr, found.corner))
     lines = [
         f"image: {image.name}",
         f"mode: {mode}",
@@ -93,6 +120,35 @@ def save_nav2(
         partial.write_text("\n".join([*lines, ""]))
     columns, rows = map(int, log_odds.shape)
     return columns, rows
+
+
+def ground_grid(
+    model: OccupancyMap,
+    resolution: float = 0.05,
+    *,
+    heights: tuple[float, float] | None = None,
+    bounds: tuple[TensorLike, TensorLike] | None = None,
+) -> GroundGrid:
+    """The log-odds that stand for each cell of the ground, as described for `save_nav2`.
+
+    Args:
+        model: a map of 2 or 3 dimensions.
+        resolution: edge of a cell [m].
+        heights: lowest and highest z of obstacles for the robot [m]; needed in 3-D.
+        bounds: lower and upper (x, y) of the grid [m]. None: all known cells, which may be none.
+
+    Returns:
+        The grid, of cells at whole multiples of the resolution.
+
+    Raises:
+        ValueError: the map is empty, heights do not fit its dimension, or the grid would not fit in
+            memory.
+    """
+    levels = _levels(model, heights, resolution)
+    log_odds, first = _ground_log_odds(model, resolution, levels, bounds)
+    if bounds is None:
+        log_odds, first = _cropped(log_odds, first)
+    return GroundGrid(log_odds, first, resolution)
 
 
 def _levels(
@@ -174,9 +230,7 @@ def _cropped(log_odds: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.nd
     """The part of the grid that contains all known cells."""
     known = np.argwhere(~np.isnan(log_odds))
     if len(known) == 0:
-        raise ValueError(
-            "the map must have known cells for Nav2; none is, or none between the heights"
-        )
+        return log_odds[:0, :0], first
     low, high = known.min(axis=0), known.max(axis=0) + 1
     return log_odds[low[0] : high[0], low[1] : high[1]], first + low
 
