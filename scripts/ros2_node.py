@@ -108,13 +108,18 @@ def triangle_corners(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
 def octomap_data(model: LardHilbertMap, resolution: float) -> array:
     """The int8 data of a binary octomap_msgs/Octomap: a .bt file without its header.
 
+    It holds the cells in the box around all centers of clusters, since what lies beyond was hardly
+    seen and would take most of the time.
+
     Raises:
         ImportError: octomap-python is not installed.
         ValueError: as for `save_grid`.
     """
+    centers = model.centers.detach().double() + model.origin
+    bounds = centers.amin(dim=0) - resolution, centers.amax(dim=0) + resolution
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.bt"
-        save_grid(model, path, resolution)
+        save_grid(model, path, resolution, bounds)
         return array("b", path.read_bytes().partition(b"\ndata\n")[2])
 
 

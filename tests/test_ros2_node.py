@@ -282,7 +282,9 @@ def test_the_node_learns_clouds_and_publishes(fake_ros, tmp_path, monkeypatch):
     assert len(marker.points) == len(marker.colors) > 0
     assert len(marker.points) % 3 == 0
     corners = np.array([[p.x, p.y, p.z] for p in marker.points])
-    distances = torch.cdist(torch.from_numpy(corners), room.hits).amin(dim=1)
+    distances = torch.cdist(torch.from_numpy(corners), simulate_room(20_000, seed=1).hits).amin(
+        dim=1
+    )
     assert distances.median() < 0.15
     if node.published["octomap"]:
         octomap = node.published["octomap"][-1]
