@@ -20,6 +20,7 @@ from lardhm_torch.cli.tiling import update_folder
 
 if TYPE_CHECKING:
     from lardhm_torch import LardHilbertMap, Samples, Scans
+    from lardhm_torch.io.foxglove_files import FoxgloveLog
 
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
@@ -62,6 +63,8 @@ def fit(arguments: argparse.Namespace) -> None:
     if arguments.tune_state is not None:
         inputs = [*arguments.scans, arguments.output]
         check_output(arguments.tune_state, MAP_SUFFIXES, inputs, option="--tune-state")
+    if arguments.mcap is not None:
+        check_output(arguments.mcap, (".mcap",), arguments.scans, option="--mcap")
     if arguments.incremental:
         _fit_incrementally(arguments)
     else:
@@ -77,6 +80,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         raise ValueError(
             "--send and --precision need --incremental; `lardhm pack` packs a finished map"
         )
+    if arguments.mcap is not None:
+        raise ValueError("--mcap needs --incremental")
     state = _tune_state(arguments.tune_state)
     scans = read_scans(arguments)
     samples = sample_rays(scans, sampling_of(arguments), seed=arguments.seed)
@@ -174,8 +179,10 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         scans, done = itertools.chain([first], scans), None
         model = _new_map(first.dim, arguments)
     send = _packet_writer(arguments)
-    with _live_view(arguments.view) as show:
-        watchers = [watch for watch in (send, show) if watch is not None]
+    with _live_view(arguments.view) as show, _foxglove_log(arguments) as log:
+        watchers = [watch for watch in (send, show, log and log.send) if watch is not None]
+        if log is not None:
+            scans = log.watch(scans)
 
         def after_scan(model: LardHilbertMap) -> None:
             for watch in watchers:
@@ -203,6 +210,25 @@ def _packet_writer(arguments: argparse.Namespace) -> Callable[[LardHilbertMap], 
 
     settings = {} if arguments.precision is None else {"precision": arguments.precision}
     return PacketWriter(arguments.send, resume=arguments.resume, **settings).send
+
+
+@contextmanager
+def _foxglove_log(arguments: argparse.Namespace) -> Iterator[FoxgloveLog | None]:
+    """The writer of an MCAP file; None if not wanted."""
+    if arguments.mcap is None:
+        if arguments.heights is not None:
+            raise ValueError("--heights needs --mcap")
+        yield None
+        return
+    from lardhm_torch.io.foxglove_files import foxglove_log
+
+    with foxglove_log(
+        arguments.mcap,
+        every=arguments.mcap_every,
+        resolution=arguments.mcap_resolution,
+        heights=arguments.heights and tuple(arguments.heights),
+    ) as log:
+        yield log
 
 
 @contextmanager
