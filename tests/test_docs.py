@@ -69,6 +69,8 @@ def test_what_a_page_says_works(page, folder, monkeypatch):
     for number, (kind, text) in enumerate(blocks(page)):
         if "viewer" in text or "lardhm view" in text:
             pytest.importorskip("viser", reason="viser is not installed")
+        if "--mcap" in text or "foxglove" in text:
+            pytest.importorskip("mcap", reason="mcap is not installed")
         if kind == "sh":
             for line in text.splitlines():
                 run_command(line, monkeypatch)

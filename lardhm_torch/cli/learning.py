@@ -180,9 +180,10 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         model = _new_map(first.dim, arguments)
     send = _packet_writer(arguments)
     with _live_view(arguments.view) as show, _foxglove_log(arguments) as log:
-        watchers = [watch for watch in (send, show, log and log.send) if watch is not None]
+        watchers = [watch for watch in (send, show) if watch is not None]
         if log is not None:
             scans = log.watch(scans)
+            watchers.append(log.send)
 
         def after_scan(model: LardHilbertMap) -> None:
             for watch in watchers:

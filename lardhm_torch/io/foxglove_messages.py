@@ -21,14 +21,8 @@ UINT8, FLOAT32 = 1, 7  # NumericType; ROS's PointField has other numbers
 _UNUSED = ("arrows", "cubes", "spheres", "cylinders", "lines", "texts", "models")
 
 
-def _object(title: str | None = None, **properties: Any) -> dict[str, Any]:
-    named = {} if title is None else {"title": title}
-    return {
-        **named,
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-    }
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties, "required": list(properties)}
 
 
 def _numbers(*names: str) -> dict[str, Any]:
@@ -41,8 +35,8 @@ def _array(items: dict[str, Any]) -> dict[str, Any]:
 
 _INTEGER, _TEXT = {"type": "integer"}, {"type": "string"}
 _BYTES = {"type": "string", "contentEncoding": "base64"}
-_TIME = _object("time", sec=_INTEGER, nsec=_INTEGER)
-_DURATION = _object("duration", sec=_INTEGER, nsec=_INTEGER)
+_TIME = {"title": "time", **_object(sec=_INTEGER, nsec=_INTEGER)}
+_DURATION = {"title": "duration", **_object(sec=_INTEGER, nsec=_INTEGER)}
 _POSE = _object(position=_numbers(*"xyz"), orientation=_numbers(*"xyzw"))
 _FIELDS = _array(_object(name=_TEXT, offset=_INTEGER, type=_INTEGER))
 _TRIANGLES = _object(
@@ -62,14 +56,12 @@ _ENTITY = _object(
     triangles=_array(_TRIANGLES),
     **{name: _array({"type": "object"}) for name in _UNUSED},
 )
-SCHEMAS = {
+_MESSAGES = {
     "foxglove.SceneUpdate": _object(
-        "foxglove.SceneUpdate",
         deletions=_array(_object(timestamp=_TIME, type=_INTEGER, id=_TEXT)),
         entities=_array(_ENTITY),
     ),
     "foxglove.PointCloud": _object(
-        "foxglove.PointCloud",
         timestamp=_TIME,
         frame_id=_TEXT,
         pose=_POSE,
@@ -78,7 +70,6 @@ SCHEMAS = {
         data=_BYTES,
     ),
     "foxglove.Grid": _object(
-        "foxglove.Grid",
         timestamp=_TIME,
         frame_id=_TEXT,
         pose=_POSE,
@@ -90,6 +81,7 @@ SCHEMAS = {
         data=_BYTES,
     ),
 }
+SCHEMAS = {name: {"title": name, **schema} for name, schema in _MESSAGES.items()}
 
 
 def scene_update(
@@ -103,7 +95,8 @@ def scene_update(
         nanoseconds: time of the message.
     """
     offsets = (np.asarray(mesh.vertices).reshape(-1, 3) - origin).round(4).tolist()
-    colors = np.asarray(mesh.visual.vertex_colors).reshape(-1, 4) / 255
+    visual: Any = mesh.visual
+    colors = np.asarray(visual.vertex_colors).reshape(-1, 4) / 255
     triangles = {
         "pose": _pose(origin),
         "points": [{"x": x, "y": y, "z": z} for x, y, z in offsets],
