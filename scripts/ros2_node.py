@@ -23,6 +23,7 @@ lardhm_torch is installed. It was written against the documented interfaces of r
 | `radius` | 0.0 | clusters farther than this from the sensor are removed [m]; 0: none |
 | `path` | | map file, written every 10 scans and at the end, see `resume_stream` |
 
+Parameters that are numbers need a decimal point: `-p max_range:=50.0`.
 Scans that come while the map is busy wait, at most 5; then the oldest is dropped, with a warning.
 Inputs are points without NaN; those at 0 0 0 are dropped, too, because drivers write "no return" so.
 """
@@ -203,8 +204,7 @@ def make_node() -> Any:
             self.surfaces = self.create_publisher(Marker, "surface", latched)
             self.octomaps = Octomap and self.create_publisher(Octomap, "octomap", latched)
             self.transforms = Buffer()
-            # a thread of its own receives transforms while a callback waits for one
-            self.listener = TransformListener(self.transforms, self, spin_thread=True)
+            self.listener = TransformListener(self.transforms, self)
             self.scans, self.model = ScanQueue(), LardHilbertMap()
             self.worker = threading.Thread(target=self.learn)
             self.worker.start()
@@ -241,9 +241,16 @@ def make_node() -> Any:
                 rclpy.try_shutdown()
 
         def publish(self, model: LardHilbertMap) -> None:
+            """Publish the map, unless ROS was shut down: the remaining scans are learned anyway."""
+            try:
+                if len(model) > 0 and self.context.ok():
+                    self.show(model)
+            except Exception:
+                if self.context.ok():
+                    raise
+
+        def show(self, model: LardHilbertMap) -> None:
             """Publish grid, surface and OctoMap of the map."""
-            if len(model) == 0 or not self.context.ok():
-                return
             resolution = self.settings["resolution"]
             found = ground_grid(model, resolution, heights=tuple(self.settings["heights"]))
             self.grids.publish(self.stamped(grid_message(OccupancyGrid(), grid_fields(found))))
@@ -261,6 +268,7 @@ def make_node() -> Any:
                 self.octomaps.publish(self.stamped(message))
 
         def stamped(self, message: Any) -> Any:
+            """The message in the frame of the map, at this time."""
             message.header.frame_id = self.settings["map_frame"]
             message.header.stamp = self.get_clock().now().to_msg()
             return message
@@ -310,12 +318,14 @@ def marker_message(
 def main() -> None:
     """Run the node until Ctrl-C."""
     import rclpy
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 
     rclpy.init()
     node = make_node()
+    executor = MultiThreadedExecutor(num_threads=2)  # receives tf while a cloud waits for its pose
+    executor.add_node(node)
     try:
-        rclpy.spin(node)
+        executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
