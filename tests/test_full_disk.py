@@ -2,6 +2,7 @@
 
 import resource
 import signal
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -32,37 +33,36 @@ def model():
     return wall_map()
 
 
-@pytest.fixture
+@contextmanager
 def limited():
-    """The size of files is limited until the test ends."""
+    """A block in which no file grows beyond the limit; pytest itself writes after it."""
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # in trimesh
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_file_that_does_not_fit_is_named_and_the_old_one_stays(model, tmp_path, limited, name):
+def test_a_file_that_does_not_fit_is_named_and_the_old_one_stays(model, tmp_path, name):
     path = tmp_path / name
     path.write_bytes(b"old")
-    with pytest.raises(OSError, match=str(path)):
+    with limited(), pytest.raises(OSError, match=str(path)):
         WRITERS[name](model, path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_command_reports_it_in_one_line(model, tmp_path, limited, capsys, monkeypatch):
-    resource.setrlimit(
-        resource.RLIMIT_FSIZE, (100_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
-    )
+def test_a_command_reports_it_in_one_line(model, tmp_path, capsys, monkeypatch):
     model.save(tmp_path / "map.pt", evidence=False)
     np.save(tmp_path / "points.npy", np.zeros((8_000, 3), np.float32))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     monkeypatch.chdir(tmp_path)
-    assert main(["query", "map.pt", "points.npy", "-o", "out.npy"]) == 1
+    with limited():
+        assert main(["query", "map.pt", "points.npy", "-o", "out.npy"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("lardhm query: ")
     assert "out.npy" in line

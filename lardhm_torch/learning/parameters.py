@@ -208,6 +208,8 @@ class MapParameters(nn.Module):
 
 def at_least_float32(tensor: Tensor) -> Tensor:
     """The tensor itself, or a float32 copy of one of half precision: maps never compute in that."""
+    if tensor.dtype in (torch.float32, torch.float64):  # quick: every query asks
+        return tensor
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 

@@ -40,6 +40,8 @@ def transformed(*tensors: Tensor) -> bool:
     """Whether a transform of `torch.func` is active, or one of the tensors is dual."""
     if torch._C._are_functorch_transforms_active():
         return True
+    if forward_ad._current_level < 0:  # no tensor is dual outside `forward_ad.dual_level`
+        return False
     return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
@@ -68,7 +70,15 @@ def _autograd(keys: torch._C.DispatchKeySet, *arguments: Any) -> Tensor:
     if transformed(*tensors):
         *kernel, _, probability = settings
         return definition(tensors, Kernel(*kernel), probability)
-    return _Occupancy.apply(keys, *arguments)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return _Occupancy.apply(keys, *arguments)
+    return _below_autograd(keys, *arguments)
+
+
+def _below_autograd(keys: torch._C.DispatchKeySet, *arguments: Any) -> Tensor:
+    with torch._C._AutoDispatchBelowAutograd():
+        below = keys & torch._C._after_autograd_keyset
+        return torch.ops.lardhm.occupancy.default.redispatch(below, *arguments)
 
 
 class _Occupancy(torch.autograd.Function):
@@ -76,9 +86,7 @@ class _Occupancy(torch.autograd.Function):
 
     @staticmethod
     def forward(keys: torch._C.DispatchKeySet, *arguments: Any) -> Tensor:
-        with torch._C._AutoDispatchBelowAutograd():
-            below = keys & torch._C._after_autograd_keyset
-            return torch.ops.lardhm.occupancy.default.redispatch(below, *arguments)
+        return _below_autograd(keys, *arguments)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
