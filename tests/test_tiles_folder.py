@@ -300,7 +300,7 @@ def room(tmp_path_factory):
     save_scans(scans, folder / "scans.npz")
     assert main(["fit", str(folder / "scans.npz"), "-o", str(folder / "map.pt")]) == 0
     model = LardHilbertMap.load(folder / "map.pt")
-    TiledMap.split(model, folder / "tiles", 2.0)
+    TiledMap.split(model.drop_channels(), folder / "tiles", 2.0)
     np.save(folder / "points.npy", scans.ends[:500].numpy())
     return folder
 
@@ -344,7 +344,7 @@ def test_view_takes_a_folder(room, capsys):
 
 
 def test_a_damaged_tile_is_a_one_line_error(room, tmp_path, capsys):
-    model = LardHilbertMap.load(room / "map.pt")
+    model = LardHilbertMap.load(room / "map.pt").drop_channels()
     TiledMap.split(model, tmp_path / "broken", 2.0)
     victim = next(iter(read_manifest(tmp_path / "broken").tiles))
     damage(tile_path(tmp_path / "broken", victim), "cut short")
