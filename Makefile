@@ -18,6 +18,12 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 WHEELS := out/wheels
 QUICK := public scans sampling features io_npz simulation kernel_cache native_query native_extremes \
 	native_gradients native_update marching atomic_files
+# Run by `make soak` only: they take as long as hundreds of others.
+LONG := tests/test_io_broken.py::test_fifty_broken_files_of_each_format_neither_crash_nor_hang \
+	tests/test_class_training.py::test_classes_without_occupancy_are_told_apart_as_by_logistic_regression_on_rbf \
+	tests/test_torch_func.py::test_an_exported_map_loads_in_a_new_process \
+	tests/test_collision.py::test_gradients_pass_gradcheck_for_ways_and_for_the_map \
+	tests/test_bodies.py::test_gradients_with_respect_to_poses_pass_gradcheck
 export MPLBACKEND := Agg
 
 .PHONY: demo test check bench soak docs wheel try-wheel versions sanitize
@@ -50,7 +56,7 @@ test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(LONG:%=--deselect %)
 
 check: .venv/ready
 	$(BIN)/ruff check .
@@ -79,6 +85,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/accuracy.py
 
 soak: .venv/ready
+	$(BIN)/python -m pytest $(LONG)
 	$(BIN)/python scripts/fuzz_readers.py
 	$(BIN)/python scripts/soak_bits.py --flips 1000 --seed 0
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0
