@@ -158,10 +158,6 @@ class LardHilbertMap(MapQueries):
         class_training.check_wrong_labels(wrong_labels)
         rng = seeded_generator(seed, "fit_classes", self.centers.device)
         labelled = class_training.check_class_points(points, classes, self.centers)
-        kept = [
-            getattr(self, name).clone()
-            for name in ("posterior_means", "posterior_variances", "posterior_scales")
-        ]
         if len(self) == 0:
             found = class_training.clustered(labelled, num_clusters, self.kernel, self.centers, rng)
         else:
@@ -178,10 +174,11 @@ class LardHilbertMap(MapQueries):
         weights = class_training.train_class_weights(
             samples, weights, config or FitConfig(), rng, wrong_labels
         )
-        is_fitted = len(self) > 0
-        parameters.write_state(self, replace(state, class_weights=weights), origin, layout)
-        if is_fitted:
-            self.posterior_means, self.posterior_variances, self.posterior_scales = kept
+        state = replace(state, class_weights=weights)
+        if len(self) == 0:
+            parameters.write_state(self, state, origin, layout)
+        else:
+            map_merging.replace_clusters(self, state, origin, slice(None), layout)
         return self
 
     @changes_map

@@ -54,7 +54,7 @@ from lardhm_torch import (
 )
 from lardhm_torch.io.nav2_files import GroundGrid, ground_grid
 from lardhm_torch.io.ros_clouds import cloud_points
-from lardhm_torch.io.trajectories import poses_from_quaternions
+from lardhm_torch.io.trajectories import move_points, poses_from_quaternions
 
 
 def points_of(cloud: Any) -> np.ndarray:
@@ -78,8 +78,8 @@ def scan_of(points: np.ndarray, transform: Any) -> Scans:
     pose = poses_from_quaternions(
         np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]], dtype=np.float64)
     )[0]
-    ends = points @ pose[:3, :3].T + pose[:3, 3]
-    return Scans(torch.from_numpy(pose[None, :3, 3].copy()), torch.from_numpy(ends))
+    ends = torch.from_numpy(move_points(pose, points))
+    return Scans(torch.from_numpy(pose[None, :3, 3].copy()), ends)
 
 
 def grid_fields(found: GroundGrid) -> dict[str, Any]:

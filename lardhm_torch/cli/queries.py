@@ -163,8 +163,8 @@ def render(arguments: argparse.Namespace) -> None:
     """Draw a map to a picture; no display is needed."""
     import numpy as np
 
-    from lardhm_torch.surfaces.channel_colors import class_colors
     from lardhm_torch.tiles.tiled_map import open_map
+    from lardhm_torch.viewing.legends import class_legend
     from lardhm_torch.viewing.rendering import render_mesh, render_slice
 
     check_output(arguments.output, (".png",), [arguments.map])
@@ -179,8 +179,7 @@ def render(arguments: argparse.Namespace) -> None:
     legend = None
     if arguments.color == "class":
         labels = np.unique(np.asarray(surface.vertex_attributes["label"]))
-        colors = class_colors(labels[labels >= 0].tolist())
-        legend = {f"class {number}": rgb for number, rgb in colors.items()}
+        legend = class_legend(labels[labels >= 0].tolist())
     render_mesh(surface, arguments.output, cut_above=arguments.cut_above, legend=legend, **angles)
     print(f"{len(surface.faces)} faces -> {arguments.output}")
 

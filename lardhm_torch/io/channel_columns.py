@@ -33,12 +33,12 @@ def channels_from_columns(columns: Columns) -> dict[str, NDArray]:
     for name in (*_INTENSITIES, *_VALUES):
         channel = name if name in _VALUES else INTENSITY
         if name in columns and channel not in found:
-            found[channel] = _finite(columns[name])
+            found[channel] = finite_values(columns[name])
     for name in _CLASSES:
         if name in columns and CLASS not in found:
             classes = class_numbers(columns[name])
             found[name if classes is None else CLASS] = (
-                _finite(columns[name]) if classes is None else classes
+                finite_values(columns[name]) if classes is None else classes
             )
     return found
 
@@ -102,6 +102,7 @@ def class_numbers(values: NDArray) -> NDArray[np.int64] | None:
     return whole.astype(np.int64) if bool(fits.all()) else None
 
 
-def _finite(values: NDArray) -> NDArray[np.float32]:
+def finite_values(values: NDArray) -> NDArray[np.float32]:
+    """Numbers of any type as float32; NaN, missing, where they are not finite."""
     numbers = values.astype(np.float32)
     return np.where(np.isfinite(numbers), numbers, np.float32(np.nan))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.io.bin_layouts import KITTI, find_layout
+from lardhm_torch.io.channel_columns import finite_values
 from lardhm_torch.io.frames import moved
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.poses import pose_beside
@@ -49,9 +50,9 @@ def _channels_of(path: Path, table: NDArray) -> dict[str, NDArray]:
     """Intensity and ring of the columns, classes of the label file."""
     channels: dict[str, NDArray] = {}
     if table.shape[1] in (4, 5):
-        channels["intensity"] = _finite(table[:, 3])
+        channels["intensity"] = finite_values(table[:, 3])
     if table.shape[1] == 5 and _is_nuscenes(path):
-        channels["ring"] = _finite(table[:, 4])
+        channels["ring"] = finite_values(table[:, 4])
     names = (path.with_suffix(".label"), path.parent.parent / "labels" / f"{path.stem}.label")
     source = next((name for name in names if name.is_file()), None)
     if source is None:
@@ -65,11 +66,6 @@ def _channels_of(path: Path, table: NDArray) -> dict[str, NDArray]:
     classes = (labels.view("<u4") & 0xFFFF).astype(np.int64)
     channels["class"] = np.where(classes == 0, -1, classes)
     return channels
-
-
-def _finite(values: NDArray) -> NDArray[np.float32]:
-    numbers = values.astype(np.float32)
-    return np.where(np.isfinite(numbers), numbers, np.float32(np.nan))
 
 
 def _is_nuscenes(path: Path) -> bool:

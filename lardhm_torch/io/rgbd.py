@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lardhm_torch.channels import COLOR
+from lardhm_torch.io.channel_columns import joined_columns
 from lardhm_torch.io.color_images import color_beside, listed_colors, read_colors
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.paths import natural_key
@@ -97,39 +98,28 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
         raise ValueError(f"an image with a pose is needed; got {without_pose} without")
     intrinsics = camera.intrinsics or _read_intrinsics(folder)
     scale = camera.depth_scale or (1000 if image_list is None else 5000)
-    ends, counts, colors = [], [], []
+    ends, counts, channels = [], [], list[dict[str, NDArray]]()
     for frame in frames:
         points, color = _image_points(frame, intrinsics, scale, camera.pixel_step)
         ends.append(move_points(frame.pose, points))
         counts.append(len(points))
-        colors.append(color)
+        channels.append({} if color is None else {COLOR: color})
     if not any(counts):
         raise ValueError("at least one pixel with a depth is needed; got none")
     return Readout(
         np.concatenate(ends),
         origins=np.stack([frame.pose[:3, 3] for frame in frames]),
         scan_id=np.repeat(np.arange(len(frames)), counts),
-        notes=(*_notes(camera, image_list, without_pose), *_color_notes(frames, colors)),
-        channels=_color_channel(colors, counts),
+        notes=(
+            *_notes(camera, image_list, without_pose),
+            *_color_notes(frames, sum(map(bool, channels))),
+        ),
+        channels=joined_columns(list(zip(channels, counts, strict=True))),
     )
 
 
-def _color_channel(
-    colors: list[NDArray[np.float32] | None], counts: list[int]
-) -> dict[str, NDArray[np.float32]]:
-    """The colors of all pixels, NaN in images without one; nothing if none has."""
-    if all(color is None for color in colors):
-        return {}
-    parts = [
-        np.full((count, 3), np.nan, np.float32) if color is None else color
-        for color, count in zip(colors, counts, strict=True)
-    ]
-    return {COLOR: np.concatenate(parts)}
-
-
-def _color_notes(frames: list[_Frame], colors: list[NDArray[np.float32] | None]) -> list[Note]:
-    """What was assumed of the color images."""
-    used = sum(color is not None for color in colors)
+def _color_notes(frames: list[_Frame], used: int) -> list[Note]:
+    """What was assumed of the color images, and that the others are not used."""
     unused = sum(frame.color is not None for frame in frames) - used
     notes = [Note("color images taken as registered to the depth images", used)] if used else []
     if unused:

@@ -12,7 +12,7 @@ from torch import nn
 
 P = ParamSpec("P")
 R = TypeVar("R")
-DTYPES = (torch.float32, torch.float64)
+DTYPES = (torch.float32, torch.float64)  # of maps that can be changed, and of all computation
 
 
 def changes_map(function: Callable[P, R]) -> Callable[P, R]:

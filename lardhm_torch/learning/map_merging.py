@@ -13,7 +13,7 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.learning.changes import changes_map
-from lardhm_torch.learning.channel_sums import joint_layout, moved_sums, with_layout
+from lardhm_torch.learning.channel_sums import Layout, joint_layout, moved_sums, with_layout
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
@@ -141,12 +141,19 @@ def _surroundings(state: MapState, kernel: Kernel) -> Iterator[Tensor]:
 
 
 def replace_clusters(
-    model: MapParameters, state: MapState, origin: Tensor, rows: Tensor | slice
+    model: MapParameters,
+    state: MapState,
+    origin: Tensor,
+    rows: Tensor | slice,
+    layout: Layout | None = None,
 ) -> None:
-    """Write clusters that were ``rows`` of the map and keep their features, with their posterior."""
+    """Write clusters that were ``rows`` of the map and keep their features, with their posterior.
+
+    ``layout`` is that of their channels; None: that of the map.
+    """
     means, variances = model.posterior_means[rows].clone(), model.posterior_variances[rows].clone()
     scales = model.posterior_scales.clone()
-    write_state(model, state, origin)
+    write_state(model, state, origin, layout)
     model.posterior_means, model.posterior_variances, model.posterior_scales = (
         means,
         variances,

@@ -103,12 +103,14 @@ def new_rows(
     raw = raw_factors(factors)
     zeros = (weights.clone(), weights.clone(), weights.clone())
     moments = (clusters.counts, clusters.means, clusters.scatters)
-    dim = clusters.means.shape[1]
-    no_sums = weights.new_zeros(len(weights), 0, 1 + dim, dtype=torch.float64)
-    no_classes = weights.new_zeros(len(weights), 0)
-    return MapState(
-        weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, no_sums, no_classes
-    )
+    without = no_channels(clusters.means)
+    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, *without)
+
+
+def no_channels(means: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, D) means -> `CHANNELS` of clusters without them: (M, 0, 1 + D) sums, (M, 0) class weights."""
+    count, dim = means.shape
+    return means.new_zeros(count, 0, 1 + dim, dtype=torch.float64), means.new_zeros(count, 0)
 
 
 def no_evidence(means: Tensor) -> Tensor:

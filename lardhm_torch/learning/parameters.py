@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.changes import normal_tensors
-from lardhm_torch.learning.channel_sums import Layout, no_sums
-from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState
+from lardhm_torch.learning.changes import DTYPES, normal_tensors
+from lardhm_torch.learning.channel_sums import Layout
+from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState, no_channels
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
 from lardhm_torch.learning.state_checks import check_settings
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
@@ -208,17 +208,14 @@ class MapParameters(nn.Module):
 
 def at_least_float32(tensor: Tensor) -> Tensor:
     """The tensor itself, or a float32 copy of one of half precision: maps never compute in that."""
-    if tensor.dtype in (torch.float32, torch.float64):  # quick: every query asks
+    if tensor.dtype in DTYPES:  # quick: every query asks
         return tensor
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def read_state(model: MapParameters) -> MapState:
     """The tensors of the map, detached but not copied."""
-    none = {
-        "channel_sums": no_sums(model.centers.detach(), {}),
-        "class_weights": model.weights.detach().new_zeros(len(model), 0),
-    }
+    none = dict(zip(CHANNELS, no_channels(model.centers.detach()), strict=True))
     tensors = {field.name: getattr(model, field.name) for field in fields(MapState)}
     return MapState(
         *(none[name] if tensor is None else tensor.detach() for name, tensor in tensors.items())
