@@ -102,13 +102,11 @@ def _functions(model: MapQueries, name: str) -> Tensor:
             f"the map must have the channel {name!r}; it has {', '.join(layout) or 'none'}. "
             "Give channels to fit or update"
         )
-    result = sums.new_zeros(len(model), rows_of(layout, dim)[name].stop, 1 + dim)
-    result = result[:, rows_of(layout, dim)[name]].contiguous()
-    if name == CLASS:
-        result = torch.cat([result, result[:, :1]], dim=1)
+    rows = rows_of(layout, dim)[name]
+    result = sums.new_zeros(len(model), rows.stop - rows.start + (name == CLASS), 1 + dim)
     seen = (sums[:, dim, 0] > 0).nonzero().squeeze(1)
     own = sums[seen]
-    channel, position = own[:, rows_of(layout, dim)[name]], own[:, : dim + 1]
+    channel, position = own[:, rows], own[:, : dim + 1]
     ones = channel.sum(dim=1) if name == CLASS else channel[:, -1]
     counts = ones[:, :1].clamp(min=1e-12)
     middle = ones[:, 1:] / counts  # (S, D) mean position of the hits with a value

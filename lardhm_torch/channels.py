@@ -19,9 +19,8 @@ import torch
 from torch import Tensor
 
 CLASS, COLOR, INTENSITY = "class", "color", "intensity"
-MOST_CLASSES = (
-    1 << 16
-)  # class numbers are below; larger ones are identifiers of objects, or mistakes
+# Class numbers are below; larger ones are identifiers of objects, or mistakes.
+MOST_CLASSES = 1 << 16
 Channels: TypeAlias = Mapping[str, Tensor]
 
 

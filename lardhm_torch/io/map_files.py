@@ -28,7 +28,8 @@ from torch import Tensor
 from lardhm_torch.io.atomic_files import replaced_file
 
 FORMAT_VERSION = 2
-CHANNEL_SETTINGS = ("channels", "class_scale")  # in the extra state of a map with channels
+# In the extra state of maps with channels or of packed maps, beside the settings.
+NOT_SETTINGS = ("channels", "class_scale", "is_packed")
 STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
 SAFETENSORS = ".safetensors"
 MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it
@@ -103,9 +104,8 @@ def check_settings(extra: Any) -> dict[str, Any]:
         raise ValueError(
             "_extra_state must hold the map's format version and settings; it does not"
         )
-    settings = {name: v for name, v in extra.items() if name not in CHANNEL_SETTINGS}
+    settings = {name: v for name, v in extra.items() if name not in NOT_SETTINGS}
     version = settings.pop("format_version")
-    settings.pop("is_packed", None)
     if version != FORMAT_VERSION:
         cure = (
             "A newer map needs a newer lardhm_torch"

@@ -30,9 +30,8 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.points import UNKNOWN, as_tensor, inliers, to_map_frame
 
-Layout: TypeAlias = dict[
-    str, Any
-]  # number of values by name; of classes, the list of their numbers
+# Number of values by name; of classes, the list of their numbers.
+Layout: TypeAlias = dict[str, Any]
 MOST_COLUMNS = 1024  # class numbers in one map; more are identifiers of objects, not classes
 
 

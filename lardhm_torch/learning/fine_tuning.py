@@ -92,8 +92,7 @@ def fine_tune(
     held_rays = _hold_out(samples, config.hold_out, rng)
     train, evaluation = _divide(samples, held_rays)
     run = TuningRun(model, config, rng, evaluation)
-    if state:
-        run.load(state)
+    run.load(state) if state else run.losses.append(run.evaluate())
     for epoch in run.epochs(progress):
         if resample and epoch:
             fresh = resample(epoch)
@@ -228,9 +227,8 @@ class TuningRun:
         evaluation: LabelledPoints,
     ) -> None:
         self.model, self.config, self.rng, self.evaluation = model, config, rng, evaluation
-        self.epoch, self.step = 0, 0
+        self.epoch, self.step, self.losses = 0, 0, list[float]()
         self._start_from(to_rows(*(value.detach() for value in self.parameters_of_map())))
-        self.losses = [self.evaluate()]
 
     def _start_from(self, start: Tensor) -> None:
         model, config, dim = self.model, self.config, self.model.dim

@@ -98,8 +98,7 @@ def tuning_steps(
         step: number of the first step, from 0.
         plan: sizes.
     """
-    fits = batches.points.dtype in native.DTYPES and native.supports(batches.points)
-    if not fits or indices.shape[1] == 0:
+    if not native.supports(batches.points) or indices.shape[1] == 0:
         return plain_steps(batches, indices, table, moving, step, plan)
     result = torch.ops.lardhm.tuning_steps(
         batches.points, indices, batches.labels, batches.factors, table.start, table.unit, *moving,

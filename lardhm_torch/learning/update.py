@@ -167,9 +167,9 @@ def _regrouped(
     kinds, floor = part.kinds, task.kernel.min_lengthscale
     classes = split_labels(points, labels)
     limit = _most_occupied(part, classes[0], num_clusters)
+    grows = num_clusters is None
     for kind, members in enumerate(classes):
         own = (kinds == kind).nonzero().squeeze(1)
-        grows = num_clusters is None
         rule = Rule(kind, max(limit, len(own)), grows, few, task.config.split_loss, floor)
         if len(own) or len(members):
             part = part.put(own, regrouped(part.rows(own), members, rule, task.rng))

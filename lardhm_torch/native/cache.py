@@ -64,9 +64,7 @@ def check_private(path: Path) -> None:
         above = place != path
         if status.st_uid not in (0, user):
             raise PermissionError(f"{place} belongs to another user (uid {status.st_uid})")
-        own_group = (
-            above and status.st_gid == user
-        )  # user private groups have the number of the user
+        own_group = above and status.st_gid == user  # a private group has the number of its user
         writable = status.st_mode & (stat.S_IWOTH if own_group else stat.S_IWOTH | stat.S_IWGRP)
         if writable and not (above and status.st_mode & stat.S_ISVTX):
             raise PermissionError(f"other users can write to {place} (cure: chmod go-w {place})")

@@ -41,6 +41,18 @@ def class_colors(classes: Sequence[int]) -> dict[int, tuple[int, int, int]]:
     return {number: (*rows[number % 20],) for number in classes}
 
 
+def label_colors(labels: np.ndarray) -> np.ndarray:
+    """(V,) class numbers, -1 where unknown -> (V, 4) uint8 RGBA."""
+    colors = _unknown_colors(len(labels))
+    for number, color in class_colors(sorted(set(labels.tolist()) - {-1})).items():
+        colors[labels == number, :3] = color
+    return colors
+
+
+def _unknown_colors(count: int) -> np.ndarray:
+    return np.full((count, 4), (*UNKNOWN_COLOR, 255), dtype=np.uint8)
+
+
 def channel_colors(model: OccupancyMap, vertices: np.ndarray, name: str) -> np.ndarray:
     """Colors of points by a channel: colors as they are, classes by number, values from dark to bright.
 
@@ -57,12 +69,9 @@ def channel_colors(model: OccupancyMap, vertices: np.ndarray, name: str) -> np.n
     """
     from matplotlib import colormaps
 
-    colors = np.full((len(vertices), 4), (*UNKNOWN_COLOR, 255), dtype=np.uint8)
     if name == CLASS:
-        labels = class_labels(model, vertices)
-        for number, color in class_colors(sorted(set(labels.tolist()) - {-1})).items():
-            colors[labels == number, :3] = color
-        return colors
+        return label_colors(class_labels(model, vertices))
+    colors = _unknown_colors(len(vertices))
     values = channel_values(model, vertices, name)
     if values.ndim == 2 and values.shape[1] != 3:
         raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from lardhm_torch.queries.grids import (
     grid_axes,
     threshold_log_odds,
 )
-from lardhm_torch.surfaces.channel_colors import class_labels
+from lardhm_torch.surfaces.channel_colors import class_labels, label_colors
 from lardhm_torch.surfaces.estimate import check_mesh_memory, estimate_mesh
 from lardhm_torch.surfaces.following import Rule, follow_surface, seed_blocks
 from lardhm_torch.surfaces.lattice import Lattice, blocks_near_boxes, border_blocks
@@ -197,13 +197,18 @@ def lattice_mesh(
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     vertices, normals, faces = vertices[used], normals[used], (np.cumsum(used) - 1)[faces]
-    has_labels = color == CLASS and len(vertices)
+    attributes: dict[str, Any] = {}
+    if color == CLASS and len(vertices):
+        attributes["label"] = class_labels(model, vertices)
+        colors: np.ndarray | None = label_colors(attributes["label"])
+    else:
+        colors = vertex_colors(model, vertices, sign, color)
     return trimesh.Trimesh(
         vertices,
         faces,
         vertex_normals=normals if len(normals) else None,
-        vertex_colors=vertex_colors(model, vertices, sign, color),
-        vertex_attributes={"label": class_labels(model, vertices)} if has_labels else None,
+        vertex_colors=colors,
+        vertex_attributes=attributes,
         process=False,
     )
 

@@ -8,10 +8,9 @@ from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, log_odds_variance
 from lardhm_torch.queries.grids import nearest_support
-from lardhm_torch.surfaces.channel_colors import channel_colors
+from lardhm_torch.surfaces.channel_colors import CHUNK_VERTICES, channel_colors
 
 COLORS = ("height", "cluster", "probability", "variance")
-CHUNK_VERTICES = 1 << 18  # vertices evaluated at a time
 
 
 @torch.no_grad()
