@@ -12,6 +12,7 @@ A missing value stays missing everywhere: it is counted, and never taken for zer
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
@@ -61,7 +62,7 @@ def _checked(name: str, values: Tensor, count: int) -> Tensor:
         )
     if values.ndim == 2 and values.shape[1] == 1 and name != CLASS:
         values = values[:, 0]
-    if bool(values.isinf().any()):
+    if not math.isfinite(values.sum()) and bool(values.isinf().any()):  # the sum is quick
         raise ValueError(f"channel {name!r} must be finite, or NaN where missing; got infinity")
     if name == COLOR:
         _check_colors(values)

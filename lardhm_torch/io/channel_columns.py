@@ -6,6 +6,7 @@ largest value tells whether 1, 255 or 65535 is white.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -105,4 +106,6 @@ def class_numbers(values: NDArray) -> NDArray[np.int64] | None:
 def finite_values(values: NDArray) -> NDArray[np.float32]:
     """Numbers of any type as float32; NaN, missing, where they are not finite."""
     numbers = values.astype(np.float32)
+    if math.isfinite(numbers.sum()):  # all are, which is the usual case
+        return numbers
     return np.where(np.isfinite(numbers), numbers, np.float32(np.nan))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from lardhm_torch.io.bin_layouts import KITTI, find_layout
 from lardhm_torch.io.channel_columns import finite_values
 from lardhm_torch.io.frames import moved
 from lardhm_torch.io.notes import Note
+from lardhm_torch.io.paths import first_file, folders_of
 from lardhm_torch.io.poses import pose_beside
 from lardhm_torch.io.readout import Readout, without_zeros
 
@@ -53,8 +55,8 @@ def _channels_of(path: Path, table: NDArray) -> dict[str, NDArray]:
         channels["intensity"] = finite_values(table[:, 3])
     if table.shape[1] == 5 and _is_nuscenes(path):
         channels["ring"] = finite_values(table[:, 4])
-    names = (path.with_suffix(".label"), path.parent.parent / "labels" / f"{path.stem}.label")
-    source = next((name for name in names if name.is_file()), None)
+    folder, above = folders_of(path)
+    source = first_file((folder, os.path.join(above, "labels")), (f"{path.stem}.label",))
     if source is None:
         return channels
     labels = np.fromfile(source, np.uint8)

@@ -27,6 +27,22 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
+def folders_of(path: Path | str) -> tuple[str, str]:
+    """The folder of a file and the one above."""
+    folder = os.path.dirname(path) or "."
+    return folder, os.path.dirname(folder) or "."
+
+
+def first_file(folders: tuple[str, ...], names: tuple[str, ...]) -> str | None:
+    """The first of some files that is there; with strings, which is faster for many small scans."""
+    for folder in folders:
+        for name in names:
+            beside = os.path.join(folder, name)
+            if os.access(beside, os.F_OK) and os.path.isfile(beside):  # the former is faster
+                return beside
+    return None
+
+
 def expand_paths(
     path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     supported: Collection[str],

@@ -19,7 +19,7 @@ from lardhm_torch.io.calibration import (
     vehicle_from_lidar,
 )
 from lardhm_torch.io.notes import Note
-from lardhm_torch.io.paths import POSE_FILES, natural_key
+from lardhm_torch.io.paths import POSE_FILES, first_file, folders_of, natural_key
 from lardhm_torch.io.pose_files import PoseFile, read_pose_file
 from lardhm_torch.io.trajectories import MAX_STAMP_GAP
 
@@ -55,24 +55,8 @@ class _Matched:
 
 def find_beside(path: Path, names: tuple[str, ...]) -> Path | None:
     """The first of some files that lies beside path or one folder up; None if there is none."""
-    beside = _find_in(_folders_of(path), names)
+    beside = first_file(folders_of(path), names)
     return None if beside is None else Path(beside)
-
-
-def _find_in(folders: tuple[str, str], names: tuple[str, ...]) -> str | None:
-    """The first of some files that is there; with strings, which is faster for many small scans."""
-    for folder in folders:
-        for name in names:
-            beside = os.path.join(folder, name)
-            if os.access(beside, os.F_OK) and os.path.isfile(beside):  # the former is faster
-                return beside
-    return None
-
-
-def _folders_of(path: Path | str) -> tuple[str, str]:
-    """The folder of a file and the one above."""
-    folder = os.path.dirname(path) or "."
-    return folder, os.path.dirname(folder) or "."
 
 
 def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
@@ -94,15 +78,15 @@ def pose_beside(path: Path, poses_frame: str | None = None) -> FoundPose | None:
     Raises:
         ValueError: the pose file is broken, fits no scan, or needs a calibration that is not there.
     """
-    places = _folders_of(path)
-    source = _find_in(places, POSE_FILES)
+    places = folders_of(path)
+    source = first_file(places, POSE_FILES)
     if source is None:
         return None
     if poses_frame not in (None, "camera", "lidar"):
         raise ValueError(
             f'poses_frame must be "camera" or "lidar" beside {source}; got {poses_frame!r}'
         )
-    folders = tuple(map(_changed, dict.fromkeys((*places, _folders_of(source)[1]))))
+    folders = tuple(map(_changed, dict.fromkeys((*places, folders_of(source)[1]))))
     files = (source, *_calibrations(places[0], source, folders))
     stamps = (*folders, *map(_changed, files))
     suffix = path.suffix.lower()
