@@ -303,6 +303,8 @@ def _info_of_folder(path: str) -> dict[str, Any]:
         "training points": sum(tile.num_points for tile in tiles),
         "origin [m]": list(manifest.origin),
     }
+    if manifest.channels:
+        rows["channels"] = list(manifest.channels)
     if tiles:
         corners = [
             [pick(axis) for axis in zip(*(tile.bounds[side] for tile in tiles), strict=True)]

@@ -72,6 +72,7 @@ class MapParameters(nn.Module):
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
         self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
         self._index = torch.empty(0, dtype=torch.uint8)
+        self._regressions: dict[str, Any] = {}  # of the channels; see `channel_queries`
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self.register_load_state_dict_pre_hook(make_room)
         self.register_state_dict_post_hook(drop_spare_rows)
