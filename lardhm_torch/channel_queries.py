@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from lardhm_torch.map_queries import MapQueries
 
 PRIOR = 1.0  # weight of the uniform prior of the classes, in hits
+RIDGE = 0.01
 NEAR = 1e-6  # sum of the features of occupied clusters below which nothing is near
 
 
@@ -175,7 +176,9 @@ def _regression(model: MapQueries, name: str) -> Regression:
         return _new_regression(model, sums, name, 0)
     known = model._regressions.get(name)
     if known is None or known.sums is not sums or known.version != sums._version:
-        known = model._regressions[name] = _new_regression(model, sums, name, sums._version)
+        known = _new_regression(model, sums, name, sums._version)
+        others = {n: r for n, r in model._regressions.items() if r.sums is sums}
+        model._regressions = {**others, name: known}
     return known
 
 
@@ -193,7 +196,7 @@ def _new_regression(model: MapQueries, sums: Tensor, name: str, version: int) ->
     counts = ones[:, :1].clamp(min=1e-12)
     middle = ones[:, 1:] / counts  # (S, D) mean position of the hits with a value
     covariance, number = _covariances(position)
-    ridge = model.min_lengthscale**2 + covariance.diagonal(dim1=-2, dim2=-1).sum(dim=-1) / number
+    ridge = RIDGE**2 + covariance.diagonal(dim1=-2, dim2=-1).sum(dim=-1) / number
     covariance = covariance + torch.diag_embed(ridge[:, None].expand_as(middle))
     products = channel[:, :, 1:] - channel[:, :, :1] * middle[:, None]
     slopes = torch.cholesky_solve(products.mT, torch.linalg.cholesky(covariance)).mT

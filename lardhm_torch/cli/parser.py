@@ -212,6 +212,7 @@ def _file_verbs(verb: Any) -> None:
     sub.add_argument(
         "--sparse", action="store_true", help="with .npz: only blocks of cells near clusters"
     )
+    sub.add_argument("--channel", metavar="NAME", help="with .npz: a channel to write, too")
     sub.add_argument(
         "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
     )
