@@ -9,13 +9,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from lardhm_torch import packing
 from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import (
     channel_sums,
     class_training,
     map_merging,
+    packing,
     parameters,
     posterior,
 )
@@ -23,11 +23,11 @@ from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.map_state import HISTORY
+from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.state_dicts import occupied_sums
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.points import training_points
 from lardhm_torch.sampling import seeded_generator
 
 

@@ -8,16 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch import channel_queries, native
-from lardhm_torch.channel_queries import ChannelSums
+from lardhm_torch import native
 from lardhm_torch.channels import CLASS
-from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
-from lardhm_torch.learning import parameters, posterior
-from lardhm_torch.learning.changes import normal_tensors
-from lardhm_torch.learning.parameters import at_least_float32
+from lardhm_torch.features import feature_matrix, lard_kernel, neighbor_fade
+from lardhm_torch.learning import channel_queries, parameters, posterior
+from lardhm_torch.learning.channel_queries import ChannelSums
+from lardhm_torch.learning.map_tensors import at_least_float32
+from lardhm_torch.learning.points import check_axes, to_map_frame
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.native.surfaces import NativeMap
-from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame
 
 
 class MapQueries(parameters.MapParameters):
@@ -179,10 +178,6 @@ class MapQueries(parameters.MapParameters):
         answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
         return self._as_answer(answer).reshape(local.shape[:-1])
 
-    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
-        centers, raw = at_least_float32(self.centers), at_least_float32(self.raw_scale_tril)
-        return centers, raw, at_least_float32(self.weights), self.kernel
-
     def _as_answer(self, values: Tensor) -> Tensor:
         return values.to(self.centers.dtype)
 
@@ -204,21 +199,3 @@ class MapQueries(parameters.MapParameters):
         centers, raw, *_ = self._tensors()
         index = self._fresh_index()
         return native.nearest_features(local, centers.detach(), raw.detach(), self.kernel, index)
-
-    def _fresh_index(self) -> Tensor:
-        """Index of the neighbor search. It is rebuilt if the centers have changed."""
-        # The operators check the index themselves; the transforms of torch.func do not use it.
-        if torch.compiler.is_compiling() or native.transformed():
-            return self._index
-        centers = at_least_float32(self.centers)
-        known = native.index_matches(self._index, centers, self.num_neighbors)
-        if not known or self._index.is_inference():
-            with normal_tensors():
-                self._index = native.build_index(centers, self.num_neighbors)
-        return self._index
-
-    def _to_map_frame(self, points: TensorLike) -> Tensor:
-        points = as_tensor(points, "points", self.origin.device)
-        check_points(points, self.dim)
-        dtype = torch.promote_types(self.centers.dtype, torch.float32)
-        return to_map_frame(points, self.origin, dtype)
