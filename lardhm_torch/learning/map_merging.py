@@ -153,12 +153,10 @@ def replace_clusters(
     """
     means, variances = model.posterior_means[rows].clone(), model.posterior_variances[rows].clone()
     scales = model.posterior_scales.clone()
-    write_state(model, state, origin, layout)
-    model.posterior_means, model.posterior_variances, model.posterior_scales = (
-        means,
-        variances,
-        scales,
-    )
+    with model.lock.writing():
+        write_state(model, state, origin, layout)
+        model.posterior_means, model.posterior_variances = means, variances
+        model.posterior_scales = scales
 
 
 @changes_map
@@ -192,6 +190,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         )
     first.check_learns()
     second.check_learns()
+    with second.lock.reading():
+        second = copy.deepcopy(second)
     joined = copy.deepcopy(first)
     if len(second) == 0:
         return joined
