@@ -180,7 +180,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         A new map, in the frame of the first.
 
     Raises:
-        ValueError: the settings differ, a map is packed, or a channel has different numbers of values.
+        ValueError: the settings differ, a map is packed, a channel has different numbers of values,
+            or the maps are too far apart for their dtype.
 
     Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, applied to two maps.
     """

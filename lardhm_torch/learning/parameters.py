@@ -17,6 +17,7 @@ from lardhm_torch.learning.channel_sums import Layout
 from lardhm_torch.learning.map_state import CHANNELS, MapState, no_channels
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
+from lardhm_torch.learning.state_checks import check_reach
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
@@ -127,7 +128,11 @@ def write_state(
         state: M clusters.
         origin: (D,) float64, world = map + origin [m].
         layout: of the channels of the state; None: that of the map.
+
+    Raises:
+        ValueError: a cluster is too far from the origin for the dtype, see `check_reach`.
     """
+    check_reach(state, model.kernel)
     old_layout = model.channel_layout
     before = MapState(*(tensor.clone() for tensor in read_state(model)))
     with model.lock.writing():
@@ -153,7 +158,11 @@ def write_rows(
         part: Q rows to write there, followed by the clusters to append.
         removed: (R,) rows to remove; clusters are only appended if R = 0.
         layout: of the channels of ``part``; it continues that of the map.
+
+    Raises:
+        ValueError: a cluster is too far from the origin for the dtype, see `check_reach`.
     """
+    check_reach(part, model.kernel)
     old_layout, old = model.channel_layout, read_state(model)
     size = len(model)
     left = size + len(part) - len(where) - len(removed)
