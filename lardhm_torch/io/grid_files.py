@@ -18,7 +18,7 @@ from lardhm_torch.channels import CLASS
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.numpy_files import array_name
 from lardhm_torch.io.octrees import new_tree, to_array
-from lardhm_torch.maps import OccupancyMap, TensorLike
+from lardhm_torch.maps import OccupancyMap, TensorLike, reads_copy
 from lardhm_torch.queries.channels import check_channel
 from lardhm_torch.queries.distance import signed_distance
 from lardhm_torch.queries.grids import (
@@ -39,6 +39,7 @@ _TREE_BYTES = 8  # for each cell near a cluster: most are unknown or merged
 _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
 
 
+@reads_copy
 def save_grid(
     model: OccupancyMap,
     path: str | os.PathLike[str],

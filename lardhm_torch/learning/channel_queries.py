@@ -19,7 +19,7 @@ multiplied by the ``class_scale`` of the map, which is 1 until `LardHilbertMap.c
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,13 +27,11 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.channels import CLASS, COLOR
 from lardhm_torch.learning.channel_sums import Layout, rows_of
+from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.maps import TensorLike
 
-if TYPE_CHECKING:
-    from lardhm_torch.map_queries import MapQueries
-
 PRIOR = 1.0  # weight of the uniform prior of the classes, in hits
-RIDGE = 0.01
+RIDGE = 1e-3  # [m] of the regressions: positions are not known better
 NEAR = 1e-6  # sum of the features of occupied clusters below which nothing is near
 
 
@@ -51,7 +49,7 @@ class ChannelSums(NamedTuple):
     classes: tuple[int, ...] = ()
 
 
-def channel_sums_of(model: MapQueries) -> dict[str, ChannelSums]:
+def channel_sums_of(model: MapTensors) -> dict[str, ChannelSums]:
     """The channels of a map by name."""
     found, sums = {}, model.channel_sums
     if sums is None:
@@ -65,10 +63,10 @@ def channel_sums_of(model: MapQueries) -> dict[str, ChannelSums]:
     return found
 
 
-def interpolate(model: MapQueries, points: TensorLike, name: str) -> Tensor:
+def interpolate(model: MapTensors, points: TensorLike, name: str) -> Tensor:
     """`MapQueries.channel`."""
     if name == CLASS:
-        return model.class_probability(points)
+        return class_probability(model, points)
     local = model._to_map_frame(points)
     mixed = _mixture(model, local, _table(model, name), sharp=True)
     total = mixed[:, -1:]
@@ -80,7 +78,7 @@ def interpolate(model: MapQueries, points: TensorLike, name: str) -> Tensor:
     return answer.reshape(*local.shape[:-1], answer.shape[1])
 
 
-def class_log_odds(model: MapQueries, points: TensorLike) -> Tensor:
+def class_log_odds(model: MapTensors, points: TensorLike) -> Tensor:
     """`MapQueries.class_log_odds`."""
     local = model._to_map_frame(points)
     answer = model.class_scale * _class_counts(model, local).log()
@@ -89,7 +87,7 @@ def class_log_odds(model: MapQueries, points: TensorLike) -> Tensor:
     return answer.reshape(*local.shape[:-1], answer.shape[1])
 
 
-def class_probability(model: MapQueries, points: TensorLike) -> Tensor:
+def class_probability(model: MapTensors, points: TensorLike) -> Tensor:
     """`MapQueries.class_probability`: the softmax of the log-odds, without logarithms if possible."""
     if model.class_weights is not None or model.class_scale != 1:
         return torch.softmax(class_log_odds(model, points), dim=-1)
@@ -99,7 +97,7 @@ def class_probability(model: MapQueries, points: TensorLike) -> Tensor:
     return answer.reshape(*local.shape[:-1], answer.shape[1])
 
 
-def _class_counts(model: MapQueries, local: Tensor) -> Tensor:
+def _class_counts(model: MapTensors, local: Tensor) -> Tensor:
     """(..., D) positions, map frame -> (N, K) class counts around them, with the prior."""
     mixed = _mixture(model, local, _table(model, CLASS), sharp=True)
     classes = mixed.shape[1] - 1
@@ -153,7 +151,7 @@ class Regression(NamedTuple):
     slopes: Tensor
 
 
-def _table(model: MapQueries, name: str) -> Tensor:
+def _table(model: MapTensors, name: str) -> Tensor:
     """(M, C, 1 + D) sums and gradients of a channel at the centers, with what divides them in the end.
 
     That is the number of hits with a value, or, for classes, 1 where there are any.
@@ -167,7 +165,7 @@ def _table(model: MapQueries, name: str) -> Tensor:
     )
 
 
-def _regression(model: MapQueries, name: str) -> Regression:
+def _regression(model: MapTensors, name: str) -> Regression:
     """The affine functions of a channel; they are kept until the channel sums change."""
     layout_entry(model.channel_layout, name)
     sums = model.channel_sums
@@ -182,7 +180,7 @@ def _regression(model: MapQueries, name: str) -> Regression:
     return known
 
 
-def _new_regression(model: MapQueries, sums: Tensor, name: str, version: int) -> Regression:
+def _new_regression(model: MapTensors, sums: Tensor, name: str, version: int) -> Regression:
     """Linear regression of a channel on the positions of the hits, in each cluster that has any."""
     dim = model.dim
     rows = rows_of(model.channel_layout, dim)[name]
@@ -221,7 +219,7 @@ def _covariances(position: Tensor) -> tuple[Tensor, Tensor]:
     return (covariance + covariance.mT) / 2, number
 
 
-def _mixture(model: MapQueries, local: Tensor, table: Tensor, *, sharp: bool) -> Tensor:
+def _mixture(model: MapTensors, local: Tensor, table: Tensor, *, sharp: bool) -> Tensor:
     """(..., D) positions, map frame, and a table -> (N, C), see `features.mixture`."""
     centers, raw_scale_tril, _, kernel = model._tensors()
     table = table.to(centers.dtype)
