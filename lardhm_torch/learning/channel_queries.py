@@ -31,7 +31,7 @@ from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.maps import TensorLike
 
 PRIOR = 1.0  # weight of the uniform prior of the classes, in hits
-RIDGE = 1e-3  # [m] of the regressions: positions are not known better
+RIDGE = 2e-3  # [m] of the regressions: positions are not known better
 NEAR = 1e-6  # sum of the features of occupied clusters below which nothing is near
 
 
