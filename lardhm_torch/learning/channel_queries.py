@@ -165,6 +165,33 @@ def _table(model: MapTensors, name: str) -> Tensor:
     )
 
 
+def affine_functions(model: MapTensors, name: str, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Regressions of a channel in the S occupied clusters, on the CPU.
+
+    Args:
+        model: a map with the channel.
+        name: of the channel; for "class", the values are the fractions of the classes.
+        places: (S, D) positions, map frame [m].
+
+    Returns:
+        (S,) number of hits with a value, (S, C) values at the places, (S, C, D) gradients [1/m].
+    """
+    found = _regression(model, name)
+    values, slopes = found.values[:, :-1, 0], found.slopes[:, :-1]
+    counts = values.sum(dim=1) if name == CLASS else found.values[:, -1, 0]
+    each = counts.clamp(min=1e-12)[:, None]
+    rows = (torch.cumsum(model.is_occupied, 0) - 1)[found.rows]
+    slopes = slopes / each[..., None]
+    offsets = places.to(found.middle)[rows] - found.middle
+    values = values / each + (slopes * offsets[:, None]).sum(dim=2)
+    size = len(places)
+    return (
+        counts.new_zeros(size).index_copy(0, rows, counts).cpu(),
+        values.new_zeros(size, values.shape[1]).index_copy(0, rows, values).cpu(),
+        slopes.new_zeros(size, *slopes.shape[1:]).index_copy(0, rows, slopes).cpu(),
+    )
+
+
 def _regression(model: MapTensors, name: str) -> Regression:
     """The affine functions of a channel; they are kept until the channel sums change."""
     layout_entry(model.channel_layout, name)
