@@ -110,8 +110,8 @@ def decode(packet: bytes, base: tuple[int, Packed] | None = None) -> tuple[int, 
     origin = np.frombuffer(packet[HEADER.size : body], "<f8").astype(np.float64)
     if not np.isfinite([*origin, scale, floor]).all() or min(scale, floor) <= 0 or neighbors < 1:
         raise ValueError("origin and settings of the packet must be finite, settings > 0")
-    columns, rest = from_planes(packet[body:], num_rows, 1 + num_columns(dim))
-    if rest:
+    columns, behind = from_planes(packet[body:], num_rows, 1 + num_columns(dim))
+    if behind:
         raise ValueError(f"packet must hold {num_rows} rows, {length} bytes; it holds more")
     before = np.zeros((0, num_columns(dim)), np.int32)
     if not is_whole:
