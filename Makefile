@@ -18,6 +18,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 WHEELS := out/wheels
 QUICK := public scans sampling features io_npz simulation kernel_cache native_query native_extremes \
 	native_gradients native_update marching atomic_files
+PARALLEL := -n auto --maxprocesses 8 --dist loadfile  # a process for each core
 # Run by `make soak` only: they take as long as hundreds of others.
 LONG := tests/test_streaming.py::test_a_stream_killed_at_any_moment_ends_as_if_it_had_not_been \
 	tests/test_tiles_fitting.py::test_killed_at_a_random_moment_the_job_ends_with_the_same_files \
@@ -65,13 +66,15 @@ test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest $(LONG:%=--deselect %)
+	@$(BIN)/python -c "from lardhm_torch import native; native.available()"  # compile the kernel once
+	$(BIN)/python -m pytest $(PARALLEL) $(LONG:%=--deselect %)
 
 check: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest $(QUICK:%=tests/test_%.py)
+	@$(BIN)/python -c "from lardhm_torch import native; native.available()"
+	$(BIN)/python -m pytest $(PARALLEL) $(QUICK:%=tests/test_%.py)
 
 wheel: .venv/wheel
 	$(BIN)/python scripts/wheels/build_wheels.py $(WHEELS)
@@ -100,3 +103,4 @@ soak: .venv/extras
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0
 	$(BIN)/python scripts/soak_tiles.py --kills 50 --seed 0
 	$(BIN)/python scripts/soak_saves.py --kills 50 --seed 0
+	$(BIN)/python scripts/soak_readers.py --seconds 60

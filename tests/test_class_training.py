@@ -14,8 +14,7 @@ from sklearn.preprocessing import StandardScaler
 from small_maps import same_map
 
 from lardhm_torch import LardHilbertMap, sample_rays, simulate_room, split_rays
-from lardhm_torch.materials import CLASS_NAMES
-from lardhm_torch.simulation import true_classes
+from lardhm_torch.simulation import CLASS_NAMES, true_classes
 
 
 def blobs():

@@ -210,7 +210,7 @@ def _packet_writer(arguments: argparse.Namespace) -> Callable[[LardHilbertMap], 
         if arguments.precision is not None:
             raise ValueError("--precision needs --send")
         return None
-    from lardhm_torch.packets import PacketWriter
+    from lardhm_torch.streaming import PacketWriter
 
     settings = {} if arguments.precision is None else {"precision": arguments.precision}
     return PacketWriter(arguments.send, resume=arguments.resume, **settings).send

@@ -27,8 +27,9 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.channels import CLASS, MOST_CLASSES, Channels, missing, select_channels
 from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.points import as_tensor, inliers, to_map_frame
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.points import UNKNOWN, as_tensor, inliers, to_map_frame
+from lardhm_torch.sampling import UNKNOWN
 
 # Number of values by name; of classes, the list of their numbers.
 Layout: TypeAlias = dict[str, Any]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,14 +12,12 @@ from lardhm_torch.channels import CLASS
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
 from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
+from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import resize, set_channels
 from lardhm_torch.learning.state_checks import check_values
 
-if TYPE_CHECKING:
-    from lardhm_torch.learning.parameters import MapParameters
 
-
-def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def make_room(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Pre-hook of `load_state_dict`: validate the state dict and adopt its number of clusters."""
     extra = map_files.check_settings(state.get(prefix + "_extra_state"))
     differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
@@ -110,7 +108,7 @@ def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
             state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
 
 
-def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def drop_spare_rows(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
     for name, _tensor in model.state_tensors():
         state[prefix + name] = map_files.without_spare_memory(state[prefix + name])

@@ -12,7 +12,7 @@ from torch import Tensor
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.packed_files import is_packed
 from lardhm_torch.learning import posterior
-from lardhm_torch.points import check_axes, check_points
+from lardhm_torch.learning.points import check_axes, check_points
 from lardhm_torch.tiles.blocks import lattice_parts, row_numbers, rows_by_number
 from lardhm_torch.tiles.indexing import Folder
 from lardhm_torch.tiles.local_maps import LocalMaps

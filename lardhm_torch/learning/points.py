@@ -12,13 +12,13 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.maps import TensorLike, to_tensor
+from lardhm_torch.sampling import UNKNOWN
 
 CHECK_CHUNK = 1 << 18  # number of labels checked at a time, to limit memory
 OUTLIER_FACTOR = (
     100.0  # outlier threshold, as a multiple of the spread of the middle 98 % of points
 )
 OUTLIER_SAMPLE = 1 << 14  # number of points used to estimate the spread
-UNKNOWN = 0.5  # label of points in unobserved space
 FRAME_CHUNK = 1 << 14  # number of points converted at a time; a chunk fits into the CPU cache
 
 

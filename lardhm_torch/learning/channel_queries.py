@@ -18,7 +18,7 @@ multiplied by the ``class_scale`` of the map, which is 1 until `LardHilbertMap.c
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,10 +26,8 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.channels import CLASS, COLOR
 from lardhm_torch.learning.channel_sums import rows_of
+from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.maps import TensorLike
-
-if TYPE_CHECKING:
-    from lardhm_torch.map_queries import MapQueries
 
 PRIOR = 1.0  # weight of the uniform prior of the classes, in hits
 NEAR = 1e-6  # sum of the features of occupied clusters below which nothing is near
@@ -49,7 +47,7 @@ class ChannelSums(NamedTuple):
     classes: tuple[int, ...] = ()
 
 
-def channel_sums_of(model: MapQueries) -> dict[str, ChannelSums]:
+def channel_sums_of(model: MapTensors) -> dict[str, ChannelSums]:
     """The channels of a map by name."""
     found, sums = {}, model.channel_sums
     if sums is None:
@@ -63,10 +61,10 @@ def channel_sums_of(model: MapQueries) -> dict[str, ChannelSums]:
     return found
 
 
-def interpolate(model: MapQueries, points: TensorLike, name: str) -> Tensor:
+def interpolate(model: MapTensors, points: TensorLike, name: str) -> Tensor:
     """`MapQueries.channel`."""
     if name == CLASS:
-        return model.class_probability(points)
+        return torch.softmax(class_log_odds(model, points), dim=-1)
     local = model._to_map_frame(points)
     mixed = _mixture(model, local, _functions(model, name), sharp=True)
     total = mixed[:, -1:]
@@ -78,7 +76,7 @@ def interpolate(model: MapQueries, points: TensorLike, name: str) -> Tensor:
     return answer.reshape(*local.shape[:-1], answer.shape[1])
 
 
-def class_log_odds(model: MapQueries, points: TensorLike) -> Tensor:
+def class_log_odds(model: MapTensors, points: TensorLike) -> Tensor:
     """`MapQueries.class_log_odds`."""
     functions = _functions(model, CLASS)
     local = model._to_map_frame(points)
@@ -91,7 +89,7 @@ def class_log_odds(model: MapQueries, points: TensorLike) -> Tensor:
     return answer.reshape(*local.shape[:-1], classes)
 
 
-def _functions(model: MapQueries, name: str) -> Tensor:
+def _functions(model: MapTensors, name: str) -> Tensor:
     """(M, C, 1 + D) sums and gradients of a channel at the centers, with what divides them in the end.
 
     That is the number of hits with a value, or, for classes, 1 where there are any.
@@ -136,7 +134,7 @@ def _covariances(position: Tensor) -> tuple[Tensor, Tensor]:
     return (covariance + covariance.mT) / 2, number
 
 
-def _mixture(model: MapQueries, local: Tensor, table: Tensor, *, sharp: bool) -> Tensor:
+def _mixture(model: MapTensors, local: Tensor, table: Tensor, *, sharp: bool) -> Tensor:
     """(..., D) positions, map frame, and a table -> (N, C), see `features.mixture`."""
     centers, raw_scale_tril, _, kernel = model._tensors()
     table = table.to(centers.dtype)
