@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lardhm_torch import features
 from lardhm_torch.io.atomic_files import replaced_file
-from lardhm_torch.learning.parameters import at_least_float32
+from lardhm_torch.learning.map_tensors import at_least_float32
 
 if TYPE_CHECKING:
     from lardhm_torch.hilbert_map import LardHilbertMap
