@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lardhm_torch.cli.outputs import MAP_SUFFIXES, check_output
+from lardhm_torch.cli.outputs import MAP_SUFFIXES, SCAN_OUTPUTS, check_output
 from lardhm_torch.cli.scan_files import (
     far_hits,
     iter_scans_of,
@@ -30,7 +30,7 @@ def simulate(arguments: argparse.Namespace) -> None:
     """Simulate scans of a furnished room."""
     from lardhm_torch import save_scans, simulate_room
 
-    check_output(arguments.output, (".npz",))
+    check_output(arguments.output, SCAN_OUTPUTS)
     scans = simulate_room(
         num_rays=arguments.rays,
         seed=arguments.seed,
@@ -46,7 +46,7 @@ def split(arguments: argparse.Namespace) -> None:
     from lardhm_torch import save_scans, split_rays
 
     for path in arguments.output:
-        check_output(path, (".npz",), arguments.scans)
+        check_output(path, SCAN_OUTPUTS, arguments.scans)
     if len({Path(path).resolve() for path in arguments.output}) == 1:
         raise ValueError(f"--output must be two different files; got {arguments.output[0]} twice")
     scans = read_scans(arguments)

@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _scan_verbs(verb: Any) -> None:
     sub = verb(learning.simulate)
-    _output(sub, "scans to write: .npz")
+    _output(sub, "scans to write: .npz, .ply or .pcd")
     sub.add_argument(
         "--rays", type=int, default=50_000, metavar="N", help="number of rays (default: 50000)"
     )
@@ -74,7 +74,7 @@ def _scan_verbs(verb: Any) -> None:
         nargs=2,
         required=True,
         metavar=("TRAIN", "TEST"),
-        help="scans to write: two .npz files",
+        help="scans to write: two .npz, .ply or .pcd files",
     )
 
 
@@ -213,6 +213,7 @@ def _file_verbs(verb: Any) -> None:
     sub.add_argument(
         "--sparse", action="store_true", help="with .npz: only blocks of cells near clusters"
     )
+    sub.add_argument("--channel", metavar="NAME", help="with .npz: a channel to write, too")
     sub.add_argument(
         "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
     )
