@@ -131,10 +131,9 @@ def save_grid(
             np.savez(file, **arrays)
         return values.numel()
     tree, count = _octomap_of(model, first_center, last_center, resolution)
-    with replaced_file(path) as unfinished:
-        write = tree.writeBinary if suffix == ".bt" else tree.write
-        if not write(os.fsencode(unfinished)):
-            raise OSError(f"{path} cannot be written")
+    content = tree.writeBinary() if suffix == ".bt" else tree.write()  # OctoMap ignores full disks
+    with replaced_file(path) as partial:
+        partial.write_bytes(content)
     return count
 
 
