@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch import native
 from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts
 from lardhm_torch.queries.grids import EVIDENCE, grid_axes, query_grid
 from lardhm_torch.queries.hazard import NEGLIGIBLE, reached
@@ -137,8 +138,8 @@ def _gain(model: OccupancyMap, view: View, max_range: float, step: float) -> Ten
     """Gain of a view in a map held in memory [bits].
 
     Depths are divided into shells, each twice as deep as the one before. In a shell, one ray stands
-    for all in a bundle that is nowhere wider than a cell. Bundles of a shell lie within those of the
-    one before, whose hazard they take over.
+    for all in a bundle that is as wide as a cell in the middle of the shell, the geometric mean of its
+    depths. Bundles of a shell lie within those of the one before, whose hazard they take over.
     """
     total, near = view.spread.new_zeros(()), 0.0
     power = model.dim - 1
@@ -147,7 +148,7 @@ def _gain(model: OccupancyMap, view: View, max_range: float, step: float) -> Ten
     bundle_before = torch.zeros_like(view.spread, dtype=torch.long)  # of each ray
     for shell in range(shells):
         far = max_range / 2 ** (shells - 1 - shell)
-        first, bundle = _first_of_each(_direction_keys(view.headings, CELL / far))
+        first, bundle = _first_of_each(_direction_keys(view.headings, math.sqrt(2) * CELL / far))
         members = torch.bincount(bundle)
         parts = torch.zeros_like(view.spread[first]).index_add(0, bundle, view.spread**power)
         before = met[bundle_before[first]]
@@ -158,8 +159,8 @@ def _gain(model: OccupancyMap, view: View, max_range: float, step: float) -> Ten
             numbers = torch.arange(start, min(count, start + STEPS_AT_ONCE), device=rows.device)
             depths = near + (numbers + 0.5) * width
             origins, headings = (t[first[rows], None] for t in view[:2])
-            log_odds = model.log_odds(origins + depths[:, None] * headings).double()
-            hazard = log_odds.clamp(min=0) * (width / SIGHT_LENGTH)
+            log_odds = model.log_odds(origins + depths[:, None] * headings)
+            hazard = log_odds.double().clamp(min=0) * (width / SIGHT_LENGTH)
             crossed = parts[rows, None] * (depths / CELL) ** power  # cells, as wide as the bundle
             crossed = torch.minimum(crossed, members[rows, None].to(crossed))
             bits = crossed * (width / CELL) * _entropy_above_known(log_odds)
@@ -207,17 +208,23 @@ def ray_spread(headings: Tensor) -> Tensor:
 
     In a cone that reaches to the k-th neighbor there are k rays.
     """
-    from scipy.spatial import cKDTree
-
     count, dim = headings.shape
     neighbors = min(NEIGHBORS, count - 1)
     if neighbors < 1 or dim == 1:
         return headings.new_full((count,), torch.inf)
-    directions = headings.cpu()
-    chords = cKDTree(directions).query(directions, k=neighbors + 1)[0][:, neighbors]
+    chords = _farthest_neighbor(headings.cpu(), neighbors + 1).to(headings)
     cone = math.pi * chords**2 if dim == 3 else 2 * chords
-    widths = (cone / neighbors) ** (1 / (dim - 1))
-    return torch.as_tensor(widths, device=headings.device, dtype=headings.dtype)
+    return (cone / neighbors) ** (1 / (dim - 1))
+
+
+def _farthest_neighbor(points: Tensor, count: int) -> Tensor:
+    """(N,) distance of the last of the nearest ``count`` of (N, D) points, each being its own first."""
+    if native.supports(points):
+        rows = native.nearest_centers(points, points, count)
+        return torch.linalg.vector_norm(points[rows] - points[:, None], dim=2).amax(dim=1)
+    from scipy.spatial import cKDTree
+
+    return torch.from_numpy(cKDTree(points).query(points, k=count)[0][:, -1])
 
 
 def _with_diagonals(dim: int) -> np.ndarray:
