@@ -25,11 +25,11 @@ def signed_distance(
 ) -> Tensor:
     """Distance to the nearest surface, negative behind it; differentiable in the points.
 
-    The surface consists of flat `faces` where the hits lie, and of kept hits that are near none. The distance is negative where the
-    nearest face is seen from behind and the map does not hold the point to be free (log-odds below
-    -1): inside of obstacles, and in the unknown space behind a wall that was seen from one side
-    only. A face seen obliquely from behind, from farther beside than below it, counts as seen from
-    its front.
+    The surface consists of flat `faces` where the hits lie, and of kept hits that are near none. The
+    distance is negative where the nearest face is seen from behind and the map does not hold the
+    point to be free (log-odds below -1): inside of obstacles, and in the unknown space behind a wall
+    that was seen from one side only. A face seen obliquely from behind, from farther beside than
+    below it, counts as seen from its front.
 
     Faces lie one standard deviation of the hits in front of their mean, because the nearest of noisy
     hits is in front of the surface. With ``to_mean`` the distance is greater by that: without bias
