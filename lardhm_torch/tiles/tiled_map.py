@@ -309,7 +309,7 @@ class TiledMap:
             result = result + zero.reshape(-1, *[1] * unknown.ndim)
             if groups:
                 result = result.index_copy(0, torch.cat(groups), torch.cat(answers))
-        return result.reshape(*points.shape[:-1], *unknown.shape)
+        return result.reshape((*points.shape[:-1], *unknown.shape))
 
     def _rows_by_block(self, flat: Tensor, result: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
         """Number of each block in which a tile contributes, and the rows of its points.
