@@ -97,3 +97,4 @@ soak: .venv/ready
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0
 	$(BIN)/python scripts/soak_tiles.py --kills 50 --seed 0
 	$(BIN)/python scripts/soak_saves.py --kills 50 --seed 0
+	$(BIN)/python scripts/soak_readers.py --seconds 60

@@ -115,8 +115,9 @@ class LardHilbertMap(MapQueries):
         task = FitTask(self.kernel, config or FitConfig(), rng, progress)
         state = fit_clusters(samples.points, samples.labels, num_clusters, task)
         state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
-        parameters.write_state(self, state, samples.origin, layout)
-        self.class_scale = 1.0
+        with self.lock.writing():
+            parameters.write_state(self, state, samples.origin, layout)
+            self.class_scale = 1.0
         return self
 
     @changes_map
@@ -235,7 +236,8 @@ class LardHilbertMap(MapQueries):
             raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
         local, labels, _ = training_points(points, labels, self.centers, self.origin)
         found = posterior.fit_posterior(*self._nearest_features(local), self.weights, labels)
-        self.posterior_means, self.posterior_variances, self.posterior_scales = found
+        with self.lock.writing():
+            self.posterior_means, self.posterior_variances, self.posterior_scales = found
         return self
 
     @changes_map
@@ -345,10 +347,11 @@ class LardHilbertMap(MapQueries):
             evidence: write the points kept by the clusters, too. Without them the file is about a
                 quarter as large, and a later `update` draws points from the clusters' moments.
         """
-        state = self.state_dict()
-        if not evidence:
-            state = {name: value for name, value in state.items() if name not in HISTORY}
-        map_files.save_state(occupied_sums(state), path)
+        with self.lock.reading():
+            state = self.state_dict()
+            if not evidence:
+                state = {name: value for name, value in state.items() if name not in HISTORY}
+            map_files.save_state(occupied_sums(state), path)
 
     def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:
         """Write a small file, about 12 bytes per cluster in 3-D, of a map that answers but cannot learn.
@@ -359,7 +362,8 @@ class LardHilbertMap(MapQueries):
             path: file, usually ``.lhm``.
             precision: fractional bits of the rounded parameters, 1 to 16 (docs/map_format.md).
         """
-        packing.save_packed(self, path, precision)
+        with self.lock.reading():
+            packing.save_packed(self, path, precision)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:

@@ -15,21 +15,24 @@ from lardhm_torch.learning import channel_queries, parameters, posterior
 from lardhm_torch.learning.channel_queries import ChannelSums
 from lardhm_torch.learning.map_tensors import at_least_float32
 from lardhm_torch.learning.points import check_axes, to_map_frame
-from lardhm_torch.maps import TensorLike
+from lardhm_torch.maps import TensorLike, reads_map
 from lardhm_torch.native.surfaces import NativeMap
 
 
 class MapQueries(parameters.MapParameters):
     """What `LardHilbertMap` answers; see there."""
 
+    @reads_map
     def forward(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
         return self._query(points, probability=True)
 
+    @reads_map
     def log_odds(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
         return self._query(points, probability=False)
 
+    @reads_map
     def features(self, points: TensorLike) -> Tensor:
         """(N, D) world positions [m] -> sparse COO (N, M) with K values per row, eq. (9)."""
         local = self._to_map_frame(points)
@@ -41,6 +44,7 @@ class MapQueries(parameters.MapParameters):
         values = values * neighbor_fade(local, centers, indices)
         return feature_matrix(indices, self._as_answer(values), len(self))
 
+    @reads_map
     def variance(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) variance of the log-odds.
 
@@ -51,6 +55,7 @@ class MapQueries(parameters.MapParameters):
         """
         return self._as_answer(self._posterior(points)[1])
 
+    @reads_map
     def bayesian_probability(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
 
@@ -65,6 +70,7 @@ class MapQueries(parameters.MapParameters):
         """Sums of the channels over the hits of each cluster, by name; views of ``channel_sums``."""
         return channel_queries.channel_sums_of(self)
 
+    @reads_map
     def channel(self, points: TensorLike, name: str) -> Tensor:
         """(..., D) world positions [m] -> (...) or (..., C) mean of a channel around them.
 
@@ -77,6 +83,7 @@ class MapQueries(parameters.MapParameters):
         """
         return channel_queries.interpolate(self, points, name)
 
+    @reads_map
     def class_log_odds(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (..., K) logarithms of the class odds, up to a constant.
 
@@ -90,6 +97,7 @@ class MapQueries(parameters.MapParameters):
         """
         return channel_queries.class_log_odds(self, points)
 
+    @reads_map
     def class_probability(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (..., K) probability of each class, given a surface there.
 
@@ -100,6 +108,7 @@ class MapQueries(parameters.MapParameters):
         """
         return torch.softmax(self.class_log_odds(points), dim=-1)
 
+    @reads_map
     def class_posterior(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (..., K + 1) distribution: free, or occupied by each class.
 
@@ -115,6 +124,7 @@ class MapQueries(parameters.MapParameters):
         return list(self.channel_layout.get(CLASS, ()))
 
     @torch.no_grad()
+    @reads_map
     def unknown(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) degree to which space is unobserved, 0 to 1.
 
@@ -133,6 +143,7 @@ class MapQueries(parameters.MapParameters):
         return self._as_answer(torch.cat(parts)).reshape(local.shape[:-1])
 
     @torch.no_grad()
+    @reads_map
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
         """Probability or log-odds at all points of a lattice, faster than one by one.
 
@@ -158,6 +169,7 @@ class MapQueries(parameters.MapParameters):
         return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
 
     @torch.no_grad()
+    @reads_map
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
         """`raycasting.raycast` in the native library; None if it does not support this map.
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.octrees import new_tree, to_array
-from lardhm_torch.maps import OccupancyMap, TensorLike
+from lardhm_torch.maps import OccupancyMap, TensorLike, reads_copy
 from lardhm_torch.queries.distance import signed_distance
 from lardhm_torch.queries.grids import (
     BLOCK_POINTS,
@@ -34,6 +34,7 @@ _TREE_BYTES = 8  # for each cell near a cluster: most are unknown or merged
 _TREE_CELLS = 1 << 15  # an OctoMap tree has so many cells on either side of zero
 
 
+@reads_copy
 def save_grid(
     model: OccupancyMap,
     path: str | os.PathLike[str],

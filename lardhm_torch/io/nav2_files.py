@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.io.atomic_files import replaced_file
-from lardhm_torch.maps import OccupancyMap, TensorLike, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, reads_copy, to_tensor
 from lardhm_torch.queries.grids import (
     EVIDENCE,
     cluster_boxes,
@@ -54,6 +54,7 @@ class GroundGrid(NamedTuple):
         return np.where(np.isnan(self.log_odds.T), -1, values).astype(np.int8)
 
 
+@reads_copy
 def save_nav2(
     model: OccupancyMap,
     path: str | os.PathLike[str],

@@ -101,7 +101,7 @@ def fine_tune(
         run.train(train)
         if after_epoch:
             after_epoch(run.state())
-    with torch.no_grad():
+    with torch.no_grad(), model.lock.writing():
         for parameter, value in zip(run.parameters_of_map(), from_rows(run.best), strict=True):
             parameter.copy_(value)
     return run.losses

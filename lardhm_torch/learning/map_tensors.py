@@ -12,6 +12,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.learning.changes import DTYPES, normal_tensors
 from lardhm_torch.learning.channel_sums import Layout
+from lardhm_torch.learning.map_lock import MapLock
 from lardhm_torch.learning.map_state import EVIDENCE
 from lardhm_torch.learning.points import as_tensor, check_points, to_map_frame
 from lardhm_torch.learning.state_checks import check_settings
@@ -65,6 +66,7 @@ class MapTensors(nn.Module):
             self._register_empty(dim, device, dtype)
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
         self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
+        self.lock = MapLock()
         self._index = torch.empty(0, dtype=torch.uint8)
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self._register_hooks()
@@ -141,11 +143,11 @@ class MapTensors(nn.Module):
     def _apply(self: AnyTensors, fn: Any, recurse: bool = True) -> AnyTensors:
         """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""
         exact = {"origin": self.origin, "channel_sums": self.channel_sums}
-        with normal_tensors():
+        with self.lock.writing(), normal_tensors():
             super()._apply(fn, recurse)
-        for name, tensor in exact.items():
-            if tensor is not None and getattr(self, name).dtype != torch.float64:
-                setattr(self, name, tensor.to(getattr(self, name).device))
+            for name, tensor in exact.items():
+                if tensor is not None and getattr(self, name).dtype != torch.float64:
+                    setattr(self, name, tensor.to(getattr(self, name).device))
         return self
 
     def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from typing import Any, TypeVar
@@ -15,6 +17,7 @@ from lardhm_torch.learning.channel_sums import Layout
 from lardhm_torch.learning.map_state import CHANNELS, MapState, no_channels
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
+from lardhm_torch.learning.state_checks import check_reach
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
@@ -28,6 +31,21 @@ class MapParameters(MapTensors):
 
     Args and attributes: see `LardHilbertMap`.
     """
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """A context in which all queries see the same map: other threads wait before they change it.
+
+        Every single query sees one map anyway, while another thread runs `fit`, `update`, `fine_tune`
+        or any other function of this package that changes the map.
+        """
+        with self.lock.reading():
+            yield
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """See `torch.nn.Module.load_state_dict`; the map adopts the number of clusters."""
+        with self.lock.changing(), self.lock.writing():
+            return super().load_state_dict(*args, **kwargs)
 
     def _register_hooks(self) -> None:
         self.register_load_state_dict_pre_hook(make_room)
@@ -56,8 +74,9 @@ class MapParameters(MapTensors):
         Returns:
             This map.
         """
-        set_channels(self, {}, has_class_weights=False)
-        self.class_scale = 1.0
+        with self.lock.writing():
+            set_channels(self, {}, has_class_weights=False)
+            self.class_scale = 1.0
         return self
 
     def extra_repr(self) -> str:
@@ -109,15 +128,20 @@ def write_state(
         state: M clusters.
         origin: (D,) float64, world = map + origin [m].
         layout: of the channels of the state; None: that of the map.
+
+    Raises:
+        ValueError: a cluster is too far from the origin for the dtype, see `check_reach`.
     """
+    check_reach(state, model.kernel)
     old_layout = model.channel_layout
     before = MapState(*(tensor.clone() for tensor in read_state(model)))
-    try:
-        assign_state(model, state, layout)
-    except BaseException:
-        assign_state(model, before, old_layout)
-        raise
-    model.origin = origin
+    with model.lock.writing():
+        try:
+            assign_state(model, state, layout)
+        except BaseException:
+            assign_state(model, before, old_layout)
+            raise
+        model.origin = origin
 
 
 def write_rows(
@@ -134,7 +158,11 @@ def write_rows(
         part: Q rows to write there, followed by the clusters to append.
         removed: (R,) rows to remove; clusters are only appended if R = 0.
         layout: of the channels of ``part``; it continues that of the map.
+
+    Raises:
+        ValueError: a cluster is too far from the origin for the dtype, see `check_reach`.
     """
+    check_reach(part, model.kernel)
     old_layout, old = model.channel_layout, read_state(model)
     size = len(model)
     left = size + len(part) - len(where) - len(removed)
@@ -142,22 +170,23 @@ def write_rows(
     holes = removed[removed < left]
     touched = torch.cat([where, holes, tail])
     before = read_state(model).rows(touched)
-    try:
-        extend_channels(model, layout)
-        resize(model, size + len(part) - len(where), keep=True)
-        assign_rows(model, where, part)
-        if len(removed):
-            assign_rows(model, holes, read_state(model).rows(tail[~torch.isin(tail, removed)]))
-            resize(model, left, keep=True)
-    except BaseException:
-        if model.channel_layout != old_layout:
-            model.channel_layout = old_layout
-            model.channel_sums = old.channel_sums if old_layout else None
-            set_class_weights(model, old.class_weights)
-        resize(model, size, keep=True)
-        assign_rows(model, touched, before)
-        raise
-    model.posterior_variances.zero_()
+    with model.lock.writing():
+        try:
+            extend_channels(model, layout)
+            resize(model, size + len(part) - len(where), keep=True)
+            assign_rows(model, where, part)
+            if len(removed):
+                assign_rows(model, holes, read_state(model).rows(tail[~torch.isin(tail, removed)]))
+                resize(model, left, keep=True)
+        except BaseException:
+            if model.channel_layout != old_layout:
+                model.channel_layout = old_layout
+                model.channel_sums = old.channel_sums if old_layout else None
+                set_class_weights(model, old.class_weights)
+            resize(model, size, keep=True)
+            assign_rows(model, touched, before)
+            raise
+        model.posterior_variances.zero_()
 
 
 def assign_rows(model: MapParameters, where: Tensor, part: MapState) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map
 from lardhm_torch.queries.grids import EVIDENCE, grid_axes, query_grid
 from lardhm_torch.queries.hazard import NEGLIGIBLE, reached
 from lardhm_torch.queries.raycasting import unit_rays
@@ -35,6 +35,7 @@ class Frontiers(NamedTuple):
 
 
 @torch.no_grad()
+@reads_map
 def frontiers(
     model: OccupancyMap,
     lower: TensorLike,
@@ -80,6 +81,7 @@ def frontiers(
 
 
 @torch.no_grad()
+@reads_map
 def information_gain(
     model: OccupancyMap,
     origin: TensorLike,
