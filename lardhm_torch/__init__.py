@@ -40,8 +40,8 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.queries.collision import segment_hazard as segment_hazard
     from lardhm_torch.queries.distance import signed_distance as signed_distance
     from lardhm_torch.queries.distance import surface_distance as surface_distance
-    from lardhm_torch.queries.exploration import frontiers as frontiers
     from lardhm_torch.queries.exploration import information_gain as information_gain
+    from lardhm_torch.queries.frontiers import frontiers as frontiers
     from lardhm_torch.queries.grids import grid as grid
     from lardhm_torch.queries.grids import query_grid as query_grid
     from lardhm_torch.queries.grids import query_slice as query_slice
@@ -89,7 +89,8 @@ _NAMES = {
     "queries.clearance": ["clearance"],
     "queries.collision": ["Mover", "expected_range", "free_probability", "segment_hazard"],
     "queries.distance": ["signed_distance", "surface_distance"],
-    "queries.exploration": ["frontiers", "information_gain"],
+    "queries.exploration": ["information_gain"],
+    "queries.frontiers": ["frontiers"],
     "queries.grids": ["grid", "query_grid", "query_slice"],
     "queries.raycasting": ["raycast"],
     "sampling": ["Samples", "SamplingConfig", "sample_rays"],

@@ -267,8 +267,10 @@ def fitted(
         return state, {}
     device = origin.device
     points, labels = as_tensor(points, "points", device), as_tensor(labels, "labels", device)
-    labels = torch.where(inliers(points), labels, 0 * labels)
     hits = hits_with_channels(points, labels, channels)
+    kept = inliers(hits.points, among=points)
+    if not bool(kept.all()):
+        hits = Hits(hits.points[kept], select_channels(hits.channels, kept))
     hits = hits._replace(points=to_map_frame(hits.points, origin, state.means.dtype))
     layout = layout_of(hits.channels)
     return with_hits(with_layout(state, {}, layout), layout, hits), layout

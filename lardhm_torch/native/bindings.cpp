@@ -112,8 +112,9 @@ Slot box(const Tensor& tensor) { return stable::detail::from(Held::of(tensor)); 
 Slot box(bool value) { return stable::detail::from(value); }
 
 #define LARDHM_SOURCES(USE)                                                                 \
-  USE(cells) USE(descent) USE(evidence) USE(faces) USE(gradients) USE(kmeans) USE(marching) \
-  USE(mixture) USE(pooling) USE(query) USE(raycast) USE(ridge) USE(tuning) USE(update)
+  USE(cells) USE(descent) USE(evidence) USE(expected_range) USE(faces) USE(gradients)       \
+  USE(kmeans) USE(marching) USE(mixture) USE(pooling) USE(query) USE(raycast) USE(ridge)    \
+  USE(tuning) USE(update)
 
 // Each source that has operators lists them.
 #define LARDHM_DECLARE(source) std::vector<Operator> source##_operators();

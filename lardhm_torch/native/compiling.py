@@ -27,7 +27,7 @@ FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
 # a unit, torch's, which only the last includes, two more.
 UNITS = (
     ("query", "kmeans", "gradients", "descent", "mixture", "tuning"),
-    ("raycast", "update", "pooling", "evidence", "cells", "marching", "ridge"),
+    ("raycast", "expected_range", "update", "pooling", "evidence", "cells", "marching", "ridge"),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
     ("bindings", "threads"),
