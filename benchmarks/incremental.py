@@ -38,7 +38,7 @@ from lardhm_torch import (
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.io.octrees import new_tree, to_array
 from lardhm_torch.learning.clustering import cluster_each, split_labels
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.streaming import real_time
 
 SETS = (

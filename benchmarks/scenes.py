@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap
-from lardhm_torch.points import morton_order
+from lardhm_torch.learning.points import morton_order
 
 AREA_PER_CLUSTER = 0.25  # [m^2] of ground
 AREA_PER_POINT = 0.005  # [m^2]

@@ -39,7 +39,7 @@ from lardhm_torch import FitConfig, LardHilbertMap, native
 from lardhm_torch.learning.clustering import clusters_from_moments, mini_batch_kmeans
 from lardhm_torch.learning.fitting import fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.points import in_morton_order
 
 # Table I and II of the paper [ms]: 8 cores of 2.5 GHz, 500 clusters.
 PAPER_STAGES = {

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the table below
@@ -12,6 +16,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.io.mesh_files import save_mesh as save_mesh
     from lardhm_torch.io.nav2_files import save_nav2 as save_nav2
     from lardhm_torch.io.notes import ScanReport as ScanReport
+    from lardhm_torch.io.onnx_files import save_onnx as save_onnx
     from lardhm_torch.io.scan_files import iter_scans as iter_scans
     from lardhm_torch.io.scan_files import load_points as load_points
     from lardhm_torch.io.scan_files import load_scans as load_scans
@@ -22,9 +27,6 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.learning.map_merging import merge_maps as merge_maps
     from lardhm_torch.learning.parameters import resize_optimizer as resize_optimizer
     from lardhm_torch.learning.update import UpdateConfig as UpdateConfig
-    from lardhm_torch.packets import PacketReceiver as PacketReceiver
-    from lardhm_torch.packets import PacketSender as PacketSender
-    from lardhm_torch.packets import PacketWriter as PacketWriter
     from lardhm_torch.queries.bodies import Body as Body
     from lardhm_torch.queries.bodies import body_collision_probability as body_collision_probability
     from lardhm_torch.queries.bodies import body_distance as body_distance
@@ -50,6 +52,9 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.scans import Scans as Scans
     from lardhm_torch.scans import split_rays as split_rays
     from lardhm_torch.simulation import simulate_room as simulate_room
+    from lardhm_torch.streaming import PacketReceiver as PacketReceiver
+    from lardhm_torch.streaming import PacketSender as PacketSender
+    from lardhm_torch.streaming import PacketWriter as PacketWriter
     from lardhm_torch.streaming import StreamConfig as StreamConfig
     from lardhm_torch.streaming import real_time as real_time
     from lardhm_torch.streaming import resume_stream as resume_stream
@@ -66,13 +71,13 @@ _NAMES = {
     "io.mesh_files": ["save_mesh"],
     "io.nav2_files": ["save_nav2"],
     "io.notes": ["ScanReport"],
+    "io.onnx_files": ["save_onnx"],
     "io.scan_files": ["iter_scans", "load_points", "load_scans", "save_scans"],
     "learning.fine_tuning": ["TuneConfig", "fine_tune"],
     "learning.fitting": ["FitConfig"],
     "learning.map_merging": ["merge_maps"],
     "learning.parameters": ["resize_optimizer"],
     "learning.update": ["UpdateConfig"],
-    "packets": ["PacketReceiver", "PacketSender", "PacketWriter"],
     "queries.bodies": [
         "Body",
         "body_collision_probability",
@@ -91,7 +96,15 @@ _NAMES = {
     "sampling": ["Samples", "SamplingConfig", "sample_rays"],
     "scans": ["Scans", "split_rays"],
     "simulation": ["simulate_room"],
-    "streaming": ["StreamConfig", "real_time", "resume_stream", "stream_scans"],
+    "streaming": [
+        "PacketReceiver",
+        "PacketSender",
+        "PacketWriter",
+        "StreamConfig",
+        "real_time",
+        "resume_stream",
+        "stream_scans",
+    ],
     "surfaces.meshing": ["extract_mesh"],
     "surfaces.simplification": ["simplify_mesh"],
     "tiles.tiled_map": ["TiledMap"],
@@ -100,9 +113,6 @@ _NAMES = {
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = sorted(_MODULE_OF)
-
-
-importlib.import_module(f"{__name__}.operator_import").define_operators()
 
 
 def __getattr__(name: str) -> Any:
@@ -115,3 +125,47 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """Return the public names, for tab completion."""
     return __all__
+
+
+# --- operators ---
+# `torch.export.load` looks operators up by name, before any function of this package is called, and
+# the package itself does not import torch, so that `import lardhm_torch` and `lardhm --help` are fast.
+
+_OPERATORS = "lardhm_torch.native.operators"
+
+
+class _AfterTorch:
+    """A finder that defines the operators at the end of `import torch`."""
+
+    def __init__(self) -> None:
+        self._is_searching = False
+
+    def find_spec(self, name: str, *_: Any) -> ModuleSpec | None:
+        if name != "torch" or self._is_searching:
+            return None
+        self._is_searching = True
+        try:
+            spec = importlib.util.find_spec("torch")  # by the other finders
+        finally:
+            self._is_searching = False
+        if spec is not None and spec.loader is not None:
+            run = spec.loader.exec_module
+
+            def run_and_define(module: ModuleType) -> None:
+                run(module)
+                sys.meta_path.remove(self)
+                importlib.import_module(_OPERATORS)
+
+            spec.loader.exec_module = run_and_define  # type: ignore[method-assign]
+        return spec
+
+
+def _define_operators() -> None:
+    """Define the operators now if torch is imported, and otherwise as soon as it is."""
+    if "torch" in sys.modules:
+        importlib.import_module(_OPERATORS)
+    else:
+        sys.meta_path.insert(0, _AfterTorch())
+
+
+_define_operators()

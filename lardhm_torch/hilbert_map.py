@@ -9,13 +9,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from lardhm_torch import packing
 from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import (
     channel_sums,
     class_training,
     map_merging,
+    packing,
     parameters,
     posterior,
 )
@@ -23,11 +23,11 @@ from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.map_state import HISTORY
+from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.state_dicts import occupied_sums
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.points import training_points
 from lardhm_torch.sampling import seeded_generator
 
 
@@ -115,8 +115,9 @@ class LardHilbertMap(MapQueries):
         task = FitTask(self.kernel, config or FitConfig(), rng, progress)
         state = fit_clusters(samples.points, samples.labels, num_clusters, task)
         state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
-        parameters.write_state(self, state, samples.origin, layout)
-        self.class_scale = 1.0
+        with self.lock.writing():
+            parameters.write_state(self, state, samples.origin, layout)
+            self.class_scale = 1.0
         return self
 
     @changes_map
@@ -151,9 +152,10 @@ class LardHilbertMap(MapQueries):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, no point has a class, or a class number,
-                probability or wrong_labels is out of range.
+            ValueError: wrong shapes, NaN or infinite points, no point has a class, a class number,
+                probability or wrong_labels is out of range, or the map is packed.
         """
+        self.check_learns()
         check_num_clusters(num_clusters)
         class_training.check_wrong_labels(wrong_labels)
         rng = seeded_generator(seed, "fit_classes", self.centers.device)
@@ -201,8 +203,9 @@ class LardHilbertMap(MapQueries):
             This map.
 
         Raises:
-            ValueError: the map has no classes, or see `fit_classes`.
+            ValueError: the map has no classes or is packed, or see `fit_classes`.
         """
+        self.check_learns()
         class_training.check_wrong_labels(wrong_labels)
         labelled = class_training.check_class_points(points, classes, self.centers)
         labelled = class_training.of_known_classes(labelled, self.classes)
@@ -235,7 +238,8 @@ class LardHilbertMap(MapQueries):
             raise ValueError("the map must be fitted before its uncertainty; it is empty: call fit")
         local, labels, _ = training_points(points, labels, self.centers, self.origin)
         found = posterior.fit_posterior(*self._nearest_features(local), self.weights, labels)
-        self.posterior_means, self.posterior_variances, self.posterior_scales = found
+        with self.lock.writing():
+            self.posterior_means, self.posterior_variances, self.posterior_scales = found
         return self
 
     @changes_map
@@ -345,21 +349,23 @@ class LardHilbertMap(MapQueries):
             evidence: write the points kept by the clusters, too. Without them the file is about a
                 quarter as large, and a later `update` draws points from the clusters' moments.
         """
-        state = self.state_dict()
-        if not evidence:
-            state = {name: value for name, value in state.items() if name not in HISTORY}
-        map_files.save_state(occupied_sums(state), path)
+        with self.lock.reading():
+            state = self.state_dict()
+            if not evidence:
+                state = {name: value for name, value in state.items() if name not in HISTORY}
+            map_files.save_state(occupied_sums(state), path)
 
     def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:
         """Write a small file, about 12 bytes per cluster in 3-D, of a map that answers but cannot learn.
 
-        Channels are left out.
+        Channels take about 10 more bytes for each color of an occupied cluster.
 
         Args:
             path: file, usually ``.lhm``.
             precision: fractional bits of the rounded parameters, 1 to 16 (docs/map_format.md).
         """
-        packing.save_packed(self, path, precision)
+        with self.lock.reading():
+            packing.save_packed(self, path, precision)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> LardHilbertMap:

@@ -8,29 +8,31 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lardhm_torch import channel_queries, native
-from lardhm_torch.channel_queries import ChannelSums
+from lardhm_torch import native
 from lardhm_torch.channels import CLASS
-from lardhm_torch.features import Kernel, feature_matrix, lard_kernel, neighbor_fade
-from lardhm_torch.learning import parameters, posterior
-from lardhm_torch.learning.changes import normal_tensors
-from lardhm_torch.learning.parameters import at_least_float32
-from lardhm_torch.maps import TensorLike
+from lardhm_torch.features import feature_matrix, lard_kernel, neighbor_fade
+from lardhm_torch.learning import channel_queries, parameters, posterior
+from lardhm_torch.learning.channel_queries import ChannelSums
+from lardhm_torch.learning.map_tensors import at_least_float32
+from lardhm_torch.learning.points import check_axes, to_map_frame
+from lardhm_torch.maps import TensorLike, reads_map
 from lardhm_torch.native.surfaces import NativeMap
-from lardhm_torch.points import as_tensor, check_axes, check_points, to_map_frame
 
 
 class MapQueries(parameters.MapParameters):
     """What `LardHilbertMap` answers; see there."""
 
+    @reads_map
     def forward(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability of occupancy, eq. (1)."""
         return self._query(points, probability=True)
 
+    @reads_map
     def log_odds(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
         return self._query(points, probability=False)
 
+    @reads_map
     def features(self, points: TensorLike) -> Tensor:
         """(N, D) world positions [m] -> sparse COO (N, M) with K values per row, eq. (9)."""
         local = self._to_map_frame(points)
@@ -42,6 +44,7 @@ class MapQueries(parameters.MapParameters):
         values = values * neighbor_fade(local, centers, indices)
         return feature_matrix(indices, self._as_answer(values), len(self))
 
+    @reads_map
     def variance(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) variance of the log-odds.
 
@@ -52,6 +55,7 @@ class MapQueries(parameters.MapParameters):
         """
         return self._as_answer(self._posterior(points)[1])
 
+    @reads_map
     def bayesian_probability(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
 
@@ -66,6 +70,7 @@ class MapQueries(parameters.MapParameters):
         """Sums of the channels over the hits of each cluster, by name; views of ``channel_sums``."""
         return channel_queries.channel_sums_of(self)
 
+    @reads_map
     def channel(self, points: TensorLike, name: str) -> Tensor:
         """(..., D) world positions [m] -> (...) or (..., C) mean of a channel around them.
 
@@ -78,6 +83,7 @@ class MapQueries(parameters.MapParameters):
         """
         return channel_queries.interpolate(self, points, name)
 
+    @reads_map
     def class_log_odds(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (..., K) logarithms of the class odds, up to a constant.
 
@@ -91,6 +97,7 @@ class MapQueries(parameters.MapParameters):
         """
         return channel_queries.class_log_odds(self, points)
 
+    @reads_map
     def class_probability(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (..., K) probability of each class, given a surface there.
 
@@ -99,16 +106,17 @@ class MapQueries(parameters.MapParameters):
         Raises:
             ValueError: the map has no classes.
         """
-        return torch.softmax(self.class_log_odds(points), dim=-1)
+        return channel_queries.class_probability(self, points)
 
+    @reads_map
     def class_posterior(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (..., K + 1) distribution: free, or occupied by each class.
 
         Raises:
             ValueError: the map has no classes.
         """
-        occupied = self._query(points, probability=True)[..., None]
-        return torch.cat([1 - occupied, occupied * self.class_probability(points)], dim=-1)
+        occupied = self._query(points, probability=True)
+        return channel_queries.joint_posterior(occupied, self.class_probability(points))
 
     @property
     def classes(self) -> list[int]:
@@ -116,6 +124,7 @@ class MapQueries(parameters.MapParameters):
         return list(self.channel_layout.get(CLASS, ()))
 
     @torch.no_grad()
+    @reads_map
     def unknown(self, points: TensorLike) -> Tensor:
         """(..., D) world positions [m] -> (...) degree to which space is unobserved, 0 to 1.
 
@@ -134,6 +143,7 @@ class MapQueries(parameters.MapParameters):
         return self._as_answer(torch.cat(parts)).reshape(local.shape[:-1])
 
     @torch.no_grad()
+    @reads_map
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
         """Probability or log-odds at all points of a lattice, faster than one by one.
 
@@ -159,6 +169,7 @@ class MapQueries(parameters.MapParameters):
         return NativeMap(*tensors, self.kernel, self._fresh_index(), self.origin)
 
     @torch.no_grad()
+    @reads_map
     def query_rays(self, origins: Tensor, directions: Tensor, march: tuple[Any, ...]) -> Any:
         """`raycasting.raycast` in the native library; None if it does not support this map.
 
@@ -178,10 +189,6 @@ class MapQueries(parameters.MapParameters):
         flat, index = local.reshape(-1, self.dim), self._fresh_index()
         answer = native.occupancy(flat, *self._tensors(), probability=probability, index=index)
         return self._as_answer(answer).reshape(local.shape[:-1])
-
-    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Kernel]:
-        centers, raw = at_least_float32(self.centers), at_least_float32(self.raw_scale_tril)
-        return centers, raw, at_least_float32(self.weights), self.kernel
 
     def _as_answer(self, values: Tensor) -> Tensor:
         return values.to(self.centers.dtype)
@@ -204,21 +211,3 @@ class MapQueries(parameters.MapParameters):
         centers, raw, *_ = self._tensors()
         index = self._fresh_index()
         return native.nearest_features(local, centers.detach(), raw.detach(), self.kernel, index)
-
-    def _fresh_index(self) -> Tensor:
-        """Index of the neighbor search. It is rebuilt if the centers have changed."""
-        # The operators check the index themselves; the transforms of torch.func do not use it.
-        if torch.compiler.is_compiling() or native.transformed():
-            return self._index
-        centers = at_least_float32(self.centers)
-        known = native.index_matches(self._index, centers, self.num_neighbors)
-        if not known or self._index.is_inference():
-            with normal_tensors():
-                self._index = native.build_index(centers, self.num_neighbors)
-        return self._index
-
-    def _to_map_frame(self, points: TensorLike) -> Tensor:
-        points = as_tensor(points, "points", self.origin.device)
-        check_points(points, self.dim)
-        dtype = torch.promote_types(self.centers.dtype, torch.float32)
-        return to_map_frame(points, self.origin, dtype)

@@ -8,8 +8,10 @@ below use these members if they are present; no other module checks for them.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Protocol, TypeAlias
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +19,8 @@ from torch import Tensor
 
 from lardhm_torch.native.surfaces import NativeMap
 
+P = ParamSpec("P")
+R = TypeVar("R")
 TensorLike: TypeAlias = Tensor | np.ndarray | Sequence[object]  # types accepted by `to_tensor`
 
 
@@ -78,6 +82,42 @@ def to_tensor(values: TensorLike, name: str, device: torch.device | str | None =
 
 
 # --- optional members ---
+
+
+def reading(model: OccupancyMap) -> AbstractContextManager[None]:
+    """A context in which no other thread changes the map, if it has ``reading``."""
+    return model.reading() if hasattr(model, "reading") else nullcontext()
+
+
+def reads_map(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function of a map, its first argument, so that it sees one state of the map."""
+
+    @functools.wraps(function)
+    def read(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        model: Any = args[0] if args else kwargs["model"]
+        with reading(model):
+            return function(*args, **kwargs)
+
+    return read
+
+
+def reads_copy(function: Callable[P, R]) -> Callable[P, R]:
+    """As `reads_map`, for functions that take long: they read a copy, and the map can change meanwhile.
+
+    A map without ``reading``, such as a tiled one, is read itself.
+    """
+
+    @functools.wraps(function)
+    def read(*args: P.args, **kwargs: P.kwargs) -> R:
+        model: Any = args[0] if args else kwargs.pop("model")
+        if hasattr(model, "reading"):
+            with reading(model):
+                model = copy.deepcopy(model)
+        return function(model, *args[1:], **kwargs)  # type: ignore[arg-type]
+
+    return read
 
 
 def pieces(model: OccupancyMap) -> Iterable[OccupancyMap]:
@@ -185,5 +225,6 @@ def log_odds_variance(model: OccupancyMap, points: Tensor) -> Tensor:
 
 def snapshot(model: OccupancyMap) -> OccupancyMap:
     """An independent in-memory copy without gradients; a tiled map is merged into one map."""
-    whole = model.merge() if hasattr(model, "merge") else copy.deepcopy(model)
+    with reading(model):
+        whole = model.merge() if hasattr(model, "merge") else copy.deepcopy(model)
     return whole.requires_grad_(False) if hasattr(whole, "requires_grad_") else whole

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
-from lardhm_torch.points import UNKNOWN
 from lardhm_torch.scans import Scans
 
+UNKNOWN = 0.5  # label of points in unobserved space
 TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
 PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
 LOST = 0.5  # of the hits outside the range limits: more than that is a mistake of units

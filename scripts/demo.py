@@ -20,8 +20,7 @@ from lardhm_torch import (
 )
 from lardhm_torch.evaluation.mesh_distances import mesh_metrics
 from lardhm_torch.evaluation.scores import format_metrics
-from lardhm_torch.materials import CLASS_NAMES
-from lardhm_torch.simulation import room_mesh
+from lardhm_torch.simulation import CLASS_NAMES, room_mesh
 from lardhm_torch.surfaces.channel_colors import channel_colors, class_colors
 from lardhm_torch.viewing.rendering import render_mesh, render_slice
 

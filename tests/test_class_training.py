@@ -14,8 +14,7 @@ from sklearn.preprocessing import StandardScaler
 from small_maps import same_map
 
 from lardhm_torch import LardHilbertMap, sample_rays, simulate_room, split_rays
-from lardhm_torch.materials import CLASS_NAMES
-from lardhm_torch.simulation import true_classes
+from lardhm_torch.simulation import CLASS_NAMES, true_classes
 
 
 def blobs():
@@ -149,3 +148,12 @@ def test_the_classes_of_a_room_survive_wrong_labels_at_once_and_scan_by_scan():
         assert found[name] > 0.95  # .97 with the 50,000 rays of the benchmark
         assert expected_calibration_error(probability, true) < 0.03
     assert found["stream"] > found["batch"] - 0.01
+
+
+def test_packed_maps_do_not_learn_classes(tmp_path):
+    points, classes = blobs()
+    LardHilbertMap(2).fit_classes(points, classes).pack(tmp_path / "map.lhm")
+    model = LardHilbertMap.load(tmp_path / "map.lhm")
+    for change in (model.fit_classes, model.calibrate_classes):
+        with pytest.raises(ValueError, match="a packed map answers but does not learn"):
+            change(points, classes)

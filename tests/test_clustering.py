@@ -19,7 +19,7 @@ from lardhm_torch.learning.clustering import (
     split_clusters,
 )
 from lardhm_torch.learning.map_state import factor_covariances
-from lardhm_torch.points import morton_order
+from lardhm_torch.learning.points import morton_order
 
 F64 = torch.float64
 

@@ -184,6 +184,21 @@ def test_maps_of_different_places_are_put_side_by_side_in_either_order():
     assert torch.equal(one.origin, first.origin)
 
 
+@pytest.mark.parametrize("how", ["merge", "update"])
+def test_places_that_float32_cannot_hold_are_refused_and_change_nothing(how):
+    """Coordinates in meters and in UTM: rounded to float32, the other map would lose 0.25 m."""
+    here, labels = wall(400, 3, seed=1)
+    there = here + torch.tensor([5e5, 5.3e6, 0.0])
+    first, second = (LardHilbertMap().fit(points, labels, 20) for points in (here, there))
+    before = first(here)
+    with pytest.raises(ValueError, match=r"near the origin.*at 5.3e\+06 m, which float32 cannot"):
+        merge_maps(first, second) if how == "merge" else first.update(there, labels)
+    assert torch.equal(first(here), before)
+    model = merge_maps(first.double(), second.double())
+    torch.testing.assert_close(model(there), second(there), atol=1e-3, rtol=0)
+    torch.testing.assert_close(model(here), first(here), atol=1e-3, rtol=0)
+
+
 def test_an_empty_map_adds_nothing():
     model, empty = wall_map(), LardHilbertMap().double()
     assert same_map(merge_maps(model, empty), model)

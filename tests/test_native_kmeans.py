@@ -12,7 +12,7 @@ from native_maps import (
 
 from lardhm_torch import native
 from lardhm_torch.learning.clustering import mini_batch_kmeans
-from lardhm_torch.points import morton_order
+from lardhm_torch.learning.points import morton_order
 
 
 @dtypes

@@ -21,7 +21,7 @@ from lardhm_torch import (
     signed_distance,
 )
 from lardhm_torch.io import packed_files
-from lardhm_torch.packing import load_state, rounded
+from lardhm_torch.learning.packing import load_state, rounded
 
 DOCS = Path(__file__).parents[1] / "docs" / "map_format.md"
 

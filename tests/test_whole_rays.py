@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from lardhm_torch import LardHilbertMap, Scans, sample_rays, simulate_room
-from lardhm_torch.points import UNKNOWN
-from lardhm_torch.sampling import NoUsableRayError
+from lardhm_torch.sampling import UNKNOWN, NoUsableRayError
 
 F64 = torch.float64
 

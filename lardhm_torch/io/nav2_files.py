@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.io.atomic_files import replaced_file
-from lardhm_torch.maps import OccupancyMap, TensorLike, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, reads_copy, to_tensor
 from lardhm_torch.queries.grids import (
     EVIDENCE,
     cluster_boxes,
@@ -53,7 +53,17 @@ class GroundGrid(NamedTuple):
         values = np.round(100 * probability)
         return np.where(np.isnan(self.log_odds.T), -1, values).astype(np.int8)
 
+    def shades(self) -> np.ndarray:
+        """(ny, nx, 4) uint8 colors: darker is more occupied, unknown cells are transparent."""
+        known = ~np.isnan(self.log_odds.T)
+        colors = np.zeros((*known.shape, 4), np.uint8)
+        probability = 1 / (1 + np.exp(-self.log_odds.T[known]))
+        colors[known, :3] = np.round(255 * (1 - probability))[:, None]
+        colors[known, 3] = 255
+        return colors
 
+
+@reads_copy
 def save_nav2(
     model: OccupancyMap,
     path: str | os.PathLike[str],

@@ -18,6 +18,7 @@ DTYPES = (torch.float32, torch.float64)  # of maps that can be changed, and of a
 def changes_map(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a function that trains or moves a map, its first argument.
 
+    Other threads that change the map wait for it, and those that read it for what it writes in the end.
     Inside, `torch.inference_mode` is off, so that the map can still be trained afterwards, and so is
     `torch.autocast`. A map of half precision or without values is refused with a ValueError.
     """
@@ -36,7 +37,7 @@ def changes_map(function: Callable[P, R]) -> Callable[P, R]:
                 f"the map must have values for {function.__name__}; it is on the meta device. "
                 "Call map.to_empty(device=...) first"
             )
-        with normal_tensors(), torch.autocast(device, enabled=False):
+        with model.lock.changing(), normal_tensors(), torch.autocast(device, enabled=False):
             _replace_inference_tensors(model)
             return function(*args, **kwargs)
 

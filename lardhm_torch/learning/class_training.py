@@ -34,9 +34,9 @@ from lardhm_torch.learning.clustering import (
 from lardhm_torch.learning.evidence import keep_points
 from lardhm_torch.learning.fitting import FitConfig, descend, stratified_batches
 from lardhm_torch.learning.map_state import MapState, new_rows
+from lardhm_torch.learning.points import as_tensor, check_samples, in_morton_order, to_map_frame
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.native import nearest_centers
-from lardhm_torch.points import as_tensor, check_samples, in_morton_order, to_map_frame
 
 CLASS_POINTS = 30  # per cluster of a class: classes overlap more than surfaces and free space
 

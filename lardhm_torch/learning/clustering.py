@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
+from lardhm_torch.learning.points import morton_order
 from lardhm_torch.native import nearest_centers
-from lardhm_torch.points import morton_order
 
 POINTS_PER_CLUSTER = 15  # minimum mean number of points per cluster in `choose_num_clusters`
 DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the noise

@@ -18,6 +18,7 @@ from lardhm_torch.learning.fitting import (
     stratified_batches,
 )
 from lardhm_torch.learning.parameters import MapParameters
+from lardhm_torch.learning.points import as_tensor, check_samples, in_morton_order, to_map_frame
 from lardhm_torch.learning.tuning_steps import (
     Batches,
     Moving,
@@ -27,8 +28,7 @@ from lardhm_torch.learning.tuning_steps import (
     to_rows,
     tuning_steps,
 )
-from lardhm_torch.points import UNKNOWN, as_tensor, check_samples, in_morton_order, to_map_frame
-from lardhm_torch.sampling import Samples, seeded_generator
+from lardhm_torch.sampling import UNKNOWN, Samples, seeded_generator
 
 MAX_BATCH = 1 << 15  # upper bound on the default batch size
 GROUP_ROWS = 1 << 21  # number of points whose neighbors are in memory at a time
@@ -101,7 +101,7 @@ def fine_tune(
         run.train(train)
         if after_epoch:
             after_epoch(run.state())
-    with torch.no_grad():
+    with torch.no_grad(), model.lock.writing():
         for parameter, value in zip(run.parameters_of_map(), from_rows(run.best), strict=True):
             parameter.copy_(value)
     return run.losses

@@ -17,7 +17,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.evidence import first_points, kept_counts
 from lardhm_torch.learning.map_state import MapState
-from lardhm_torch.points import UNKNOWN
+from lardhm_torch.sampling import UNKNOWN
 
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
 NARROWEST = 0.03  # [m] standard deviation of kernels here: few points pass through smaller ones

@@ -153,12 +153,10 @@ def replace_clusters(
     """
     means, variances = model.posterior_means[rows].clone(), model.posterior_variances[rows].clone()
     scales = model.posterior_scales.clone()
-    write_state(model, state, origin, layout)
-    model.posterior_means, model.posterior_variances, model.posterior_scales = (
-        means,
-        variances,
-        scales,
-    )
+    with model.lock.writing():
+        write_state(model, state, origin, layout)
+        model.posterior_means, model.posterior_variances = means, variances
+        model.posterior_scales = scales
 
 
 @changes_map
@@ -182,7 +180,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         A new map, in the frame of the first.
 
     Raises:
-        ValueError: the settings differ, a map is packed, or a channel has different numbers of values.
+        ValueError: the settings differ, a map is packed, a channel has different numbers of values,
+            or the maps are too far apart for their dtype.
 
     Source: Guizilini & Ramos 2016, Algorithm 2, lines 4 to 16, applied to two maps.
     """
@@ -192,6 +191,8 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
         )
     first.check_learns()
     second.check_learns()
+    with second.lock.reading():
+        second = copy.deepcopy(second)
     joined = copy.deepcopy(first)
     if len(second) == 0:
         return joined

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lardhm_torch.features import Kernel, kernel_factors
 from lardhm_torch.io import map_files
-from lardhm_torch.learning.changes import DTYPES, normal_tensors
 from lardhm_torch.learning.channel_sums import Layout
-from lardhm_torch.learning.map_state import CHANNELS, EVIDENCE, MapState, no_channels
+from lardhm_torch.learning.map_state import CHANNELS, MapState, no_channels
+from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
-from lardhm_torch.learning.state_checks import check_settings
+from lardhm_torch.learning.state_checks import check_reach
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
@@ -26,88 +26,30 @@ AnyMap = TypeVar("AnyMap", bound="MapParameters")
 os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 
-class MapParameters(nn.Module):
+class MapParameters(MapTensors):
     """Tensors and settings of a map: everything in its state dict.
 
     Args and attributes: see `LardHilbertMap`.
     """
 
-    weights: nn.Parameter
-    centers: nn.Parameter
-    raw_scale_tril: nn.Parameter
-    is_occupied: Tensor
-    counts: Tensor
-    means: Tensor
-    scatters: Tensor
-    evidence: Tensor
-    losses: Tensor
-    doubts: Tensor
-    fresh: Tensor
-    posterior_means: Tensor
-    posterior_variances: Tensor
-    posterior_scales: Tensor
-    origin: Tensor
-    channel_sums: Tensor | None
-    class_weights: nn.Parameter | None
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """A context in which all queries see the same map: other threads wait before they change it.
 
-    def __init__(
-        self,
-        dim: int = 3,
-        num_neighbors: int = 16,
-        *,
-        covariance_scale: float = 4.0,
-        min_lengthscale: float = 0.01,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
-    ) -> None:
-        super().__init__()
-        check_settings(dim, num_neighbors, covariance_scale, min_lengthscale)
-        self.dim = dim
-        self.num_neighbors = num_neighbors
-        self.covariance_scale = float(covariance_scale)
-        self.min_lengthscale = float(min_lengthscale)
-        self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
-        with normal_tensors():
-            self._register_empty(dim, device, dtype)
-        self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
-        self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
-        self._index = torch.empty(0, dtype=torch.uint8)
-        self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
+        Every single query sees one map anyway, while another thread runs `fit`, `update`, `fine_tune`
+        or any other function of this package that changes the map.
+        """
+        with self.lock.reading():
+            yield
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """See `torch.nn.Module.load_state_dict`; the map adopts the number of clusters."""
+        with self.lock.changing(), self.lock.writing():
+            return super().load_state_dict(*args, **kwargs)
+
+    def _register_hooks(self) -> None:
         self.register_load_state_dict_pre_hook(make_room)
         self.register_state_dict_post_hook(drop_spare_rows)
-
-    def _register_empty(
-        self, dim: int, device: torch.device | str | None, dtype: torch.dtype | None
-    ) -> None:
-        """Register parameters and buffers without clusters."""
-        weights = torch.zeros(0, device=device, dtype=dtype)
-        if not weights.is_floating_point():
-            raise ValueError(f"dtype must be a floating point type; got {dtype}")
-        columns = {
-            "weights": nn.Parameter(weights),
-            "centers": nn.Parameter(weights.new_zeros(0, dim), requires_grad=False),
-            "raw_scale_tril": nn.Parameter(weights.new_zeros(0, dim, dim), requires_grad=False),
-        }
-        for name, parameter in columns.items():
-            self.register_parameter(name, parameter)
-        buffers = {
-            "is_occupied": weights.new_zeros(0, dtype=torch.bool),
-            "counts": weights.new_zeros(0, dtype=torch.long),
-            "means": weights.new_zeros(0, dim),
-            "scatters": weights.new_zeros(0, dim, dim),
-            "evidence": weights.new_zeros(0, EVIDENCE, dim),
-            "losses": weights.new_zeros(0),
-            "doubts": weights.new_zeros(0),
-            "fresh": weights.new_zeros(0),
-            "posterior_means": weights.new_zeros(0),
-            "posterior_variances": weights.new_zeros(0),
-            "posterior_scales": weights.new_ones(2),
-            "origin": weights.new_zeros(dim, dtype=torch.float64),
-            "channel_sums": None,
-        }
-        for name, tensor in buffers.items():
-            self.register_buffer(name, tensor)
-        self.register_parameter("class_weights", None)
 
     @classmethod
     def from_state(cls: type[AnyMap], state: dict[str, Any]) -> AnyMap:
@@ -115,39 +57,6 @@ class MapParameters(nn.Module):
         model = cls(**map_files.map_settings(state), dtype=state["centers"].dtype)
         model.load_state_dict(state)
         return model
-
-    def __len__(self) -> int:
-        """Number of clusters M."""
-        return len(self.weights)
-
-    def __bool__(self) -> bool:
-        """True, even if the map is empty."""
-        return True
-
-    @property
-    def scale_tril(self) -> Tensor:
-        """(M, D, D) lower Cholesky factors of the kernels [m], settings of the kernel applied."""
-        return kernel_factors(at_least_float32(self.raw_scale_tril), self.kernel)
-
-    @property
-    def kernel(self) -> Kernel:
-        """Number of neighbors, covariance scale and minimum length-scale of the kernels."""
-        return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Constructor arguments of an empty map with the same settings."""
-        return {
-            "dim": self.dim,
-            "num_neighbors": self.num_neighbors,
-            "covariance_scale": self.covariance_scale,
-            "min_lengthscale": self.min_lengthscale,
-        }
-
-    def state_tensors(self) -> Iterator[tuple[str, Tensor]]:
-        """Names and tensors of all parameters and buffers."""
-        yield from self.named_parameters(recurse=False)
-        yield from self.named_buffers(recurse=False)
 
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
         """Parameter groups for an optimizer, with weight decay on the weights only.
@@ -165,8 +74,9 @@ class MapParameters(nn.Module):
         Returns:
             This map.
         """
-        set_channels(self, {}, has_class_weights=False)
-        self.class_scale = 1.0
+        with self.lock.writing():
+            set_channels(self, {}, has_class_weights=False)
+            self.class_scale = 1.0
         return self
 
     def extra_repr(self) -> str:
@@ -195,23 +105,6 @@ class MapParameters(nn.Module):
                 "Load the file written by save, or make a new map"
             )
 
-    def _apply(self, fn: Any, recurse: bool = True) -> MapParameters:
-        """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""
-        exact = {"origin": self.origin, "channel_sums": self.channel_sums}
-        with normal_tensors():
-            super()._apply(fn, recurse)
-        for name, tensor in exact.items():
-            if tensor is not None and getattr(self, name).dtype != torch.float64:
-                setattr(self, name, tensor.to(getattr(self, name).device))
-        return self
-
-
-def at_least_float32(tensor: Tensor) -> Tensor:
-    """The tensor itself, or a float32 copy of one of half precision: maps never compute in that."""
-    if tensor.dtype in DTYPES:  # quick: every query asks
-        return tensor
-    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
-
 
 def read_state(model: MapParameters) -> MapState:
     """The tensors of the map, detached but not copied."""
@@ -235,15 +128,20 @@ def write_state(
         state: M clusters.
         origin: (D,) float64, world = map + origin [m].
         layout: of the channels of the state; None: that of the map.
+
+    Raises:
+        ValueError: a cluster is too far from the origin for the dtype, see `check_reach`.
     """
+    check_reach(state, model.kernel)
     old_layout = model.channel_layout
     before = MapState(*(tensor.clone() for tensor in read_state(model)))
-    try:
-        assign_state(model, state, layout)
-    except BaseException:
-        assign_state(model, before, old_layout)
-        raise
-    model.origin = origin
+    with model.lock.writing():
+        try:
+            assign_state(model, state, layout)
+        except BaseException:
+            assign_state(model, before, old_layout)
+            raise
+        model.origin = origin
 
 
 def write_rows(
@@ -260,7 +158,11 @@ def write_rows(
         part: Q rows to write there, followed by the clusters to append.
         removed: (R,) rows to remove; clusters are only appended if R = 0.
         layout: of the channels of ``part``; it continues that of the map.
+
+    Raises:
+        ValueError: a cluster is too far from the origin for the dtype, see `check_reach`.
     """
+    check_reach(part, model.kernel)
     old_layout, old = model.channel_layout, read_state(model)
     size = len(model)
     left = size + len(part) - len(where) - len(removed)
@@ -268,22 +170,23 @@ def write_rows(
     holes = removed[removed < left]
     touched = torch.cat([where, holes, tail])
     before = read_state(model).rows(touched)
-    try:
-        extend_channels(model, layout)
-        resize(model, size + len(part) - len(where), keep=True)
-        assign_rows(model, where, part)
-        if len(removed):
-            assign_rows(model, holes, read_state(model).rows(tail[~torch.isin(tail, removed)]))
-            resize(model, left, keep=True)
-    except BaseException:
-        if model.channel_layout != old_layout:
-            model.channel_layout = old_layout
-            model.channel_sums = old.channel_sums if old_layout else None
-            set_class_weights(model, old.class_weights)
-        resize(model, size, keep=True)
-        assign_rows(model, touched, before)
-        raise
-    model.posterior_variances.zero_()
+    with model.lock.writing():
+        try:
+            extend_channels(model, layout)
+            resize(model, size + len(part) - len(where), keep=True)
+            assign_rows(model, where, part)
+            if len(removed):
+                assign_rows(model, holes, read_state(model).rows(tail[~torch.isin(tail, removed)]))
+                resize(model, left, keep=True)
+        except BaseException:
+            if model.channel_layout != old_layout:
+                model.channel_layout = old_layout
+                model.channel_sums = old.channel_sums if old_layout else None
+                set_class_weights(model, old.class_weights)
+            resize(model, size, keep=True)
+            assign_rows(model, touched, before)
+            raise
+        model.posterior_variances.zero_()
 
 
 def assign_rows(model: MapParameters, where: Tensor, part: MapState) -> None:

@@ -33,7 +33,7 @@ from lardhm_torch.learning.evidence import (
 )
 from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState, factor_covariances, new_rows
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
@@ -11,14 +9,12 @@ from lardhm_torch.channels import CLASS
 from lardhm_torch.learning.changes import normal_tensors
 from lardhm_torch.learning.channel_sums import Layout, conformed, no_sums
 from lardhm_torch.learning.map_state import PER_MAP
-
-if TYPE_CHECKING:
-    from lardhm_torch.learning.parameters import MapParameters
+from lardhm_torch.learning.map_tensors import MapTensors
 
 SPARE_FRACTION = 0.25  # spare capacity of a growing map, as a fraction of its clusters
 
 
-def resize(model: MapParameters, num_clusters: int, *, keep: bool = False) -> None:
+def resize(model: MapTensors, num_clusters: int, *, keep: bool = False) -> None:
     """Change the number of clusters. Parameters remain the same objects, so optimizers stay valid.
 
     Args:
@@ -44,7 +40,7 @@ def _zeros(tensor: Tensor, rows: int) -> Tensor:
     return tensor.detach().new_zeros(rows, *tensor.shape[1:])
 
 
-def _with_rows(model: MapParameters, name: str, rows: int) -> Tensor:
+def _with_rows(model: MapTensors, name: str, rows: int) -> Tensor:
     """The tensor with a different number of rows. Added rows are 0.
 
     The storage is reused if it is large enough and was allocated by this function. Any other storage
@@ -79,7 +75,7 @@ def _set_shape(parameter: nn.Parameter, room: Tensor) -> None:
     parameter.data = room
 
 
-def set_channels(model: MapParameters, layout: Layout, has_class_weights: bool) -> None:
+def set_channels(model: MapTensors, layout: Layout, has_class_weights: bool) -> None:
     """Give a map the channels of a layout, with sums of 0."""
     model.channel_layout = layout
     model.channel_sums = no_sums(model.centers.detach(), layout) if layout else None
@@ -87,7 +83,7 @@ def set_channels(model: MapParameters, layout: Layout, has_class_weights: bool) 
     set_class_weights(model, model.weights.detach().new_zeros(len(model), classes))
 
 
-def extend_channels(model: MapParameters, layout: Layout) -> None:
+def extend_channels(model: MapTensors, layout: Layout) -> None:
     """Give a map more channels and classes; those that it has already keep their values.
 
     Args:
@@ -108,7 +104,7 @@ def extend_channels(model: MapParameters, layout: Layout) -> None:
         set_class_weights(model, padded)
 
 
-def set_class_weights(model: MapParameters, weights: Tensor) -> None:
+def set_class_weights(model: MapTensors, weights: Tensor) -> None:
     """Replace the class weights (M, K) of a map; K = 0: it has none. The parameter stays the same."""
     if weights.shape[1] == 0:
         model.class_weights = None

@@ -20,7 +20,8 @@ from lardhm_torch.learning.fitting import (
 )
 from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState
-from lardhm_torch.points import UNKNOWN, morton_order
+from lardhm_torch.learning.points import morton_order
+from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 128  # clusters that are chosen for training together

@@ -8,7 +8,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from lardhm_torch.features import Kernel
+from lardhm_torch.learning.map_state import MapState
+
 NOT_NEGATIVE = ("counts", "losses", "doubts", "fresh", "posterior_variances", "posterior_scales")
+ROUNDING = 1 / 16  # of a length-scale: more than that must not be lost by rounding a center
 MOST_NEIGHBORS = 1 << 30  # as many as the native kernel can index
 
 
@@ -63,4 +67,27 @@ def _check_factors(raw_scale_tril: Tensor) -> None:
         raise ValueError(
             f"raw_scale_tril must be at most {most:.4g} on its diagonals, which are logarithms of "
             f"length-scales; got {logs.max().item():g}"
+        )
+
+
+def check_reach(state: MapState, kernel: Kernel) -> None:
+    """Raise a ValueError if clusters are so far from the origin that rounding would move surfaces.
+
+    The spacing of floating point numbers at a center must be below `ROUNDING` of the smallest
+    length-scale of the cluster.
+
+    Args:
+        state: M clusters, map frame [m].
+        kernel: settings of the map.
+    """
+    logs = state.raw_scale_tril.diagonal(dim1=-2, dim2=-1)
+    scales = kernel.covariance_scale**0.5 * logs.exp().clamp(min=kernel.min_lengthscale)
+    lost = state.centers.abs() * torch.finfo(state.centers.dtype).eps / scales
+    if bool((lost > ROUNDING).any()):
+        worst = divmod(int(lost.argmax()), lost.shape[1])
+        raise ValueError(
+            "clusters must be near the origin of the map for their size; got one of "
+            f"{float(scales[worst]):.3g} m at {float(state.centers[worst]):.3g} m, which "
+            f"{str(state.centers.dtype).removeprefix('torch.')} cannot hold. Use a map in float64, or "
+            "one map for each place"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,14 +12,12 @@ from lardhm_torch.channels import CLASS
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
 from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
+from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import resize, set_channels
 from lardhm_torch.learning.state_checks import check_values
 
-if TYPE_CHECKING:
-    from lardhm_torch.learning.parameters import MapParameters
 
-
-def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def make_room(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Pre-hook of `load_state_dict`: validate the state dict and adopt its number of clusters."""
     extra = map_files.check_settings(state.get(prefix + "_extra_state"))
     differing = {k: (v, extra[k]) for k, v in model.settings.items() if extra[k] != v}
@@ -40,8 +38,8 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
         name: tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
         for name, tensor in own.items()
     }
-    _spread_sums(state, prefix, num_clusters)
-    layout, own_shapes = _channel_shapes(state, prefix, model.dim)
+    spread_sums(state, prefix, num_clusters)
+    layout, own_shapes = channel_shapes(state, prefix, model.dim)
     shapes.update({name: (num_clusters, *shape) for name, shape in own_shapes.items()})
     for name, shape in shapes.items():
         if state[prefix + name].shape != torch.Size(shape):
@@ -49,13 +47,13 @@ def make_room(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any)
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
                 f"got {tuple(state[prefix + name].shape)}"
             )
-    check_values({name: state[prefix + name] for name in own})
+    check_values({name: state[prefix + name] for name in (*own, *own_shapes)})
     resize(model, num_clusters)
     model.class_scale = _class_scale(state, prefix)
     set_channels(model, layout, has_class_weights="class_weights" in own_shapes)
 
 
-def _channel_shapes(
+def channel_shapes(
     state: dict[str, Any], prefix: str, dim: int
 ) -> tuple[Layout, dict[str, tuple[int, ...]]]:
     """The layout of the channels, and the shape of a row of each of their tensors."""
@@ -80,7 +78,7 @@ def occupied_sums(state: dict[str, Any]) -> dict[str, Any]:
     return {**state, "channel_sums": state["channel_sums"][state["is_occupied"]]}
 
 
-def _spread_sums(state: dict[str, Any], prefix: str, num_clusters: int) -> None:
+def spread_sums(state: dict[str, Any], prefix: str, num_clusters: int) -> None:
     """Undo `occupied_sums` in the state dict of a file."""
     sums, rows = state.get(prefix + "channel_sums"), state[prefix + "is_occupied"]
     if not isinstance(sums, Tensor) or sums.ndim != 3 or rows.dtype != torch.bool:
@@ -110,7 +108,7 @@ def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
             state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
 
 
-def drop_spare_rows(model: MapParameters, state: dict[str, Any], prefix: str, *_: Any) -> None:
+def drop_spare_rows(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Post-hook of `state_dict`: copy tensors with spare capacity, which would be saved otherwise."""
     for name, _tensor in model.state_tensors():
         state[prefix + name] = map_files.without_spare_memory(state[prefix + name])

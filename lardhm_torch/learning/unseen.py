@@ -15,7 +15,8 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.clustering import Clusters, points_where
 from lardhm_torch.learning.map_state import MapState, factor_covariances
-from lardhm_torch.points import UNKNOWN, in_morton_order
+from lardhm_torch.learning.points import in_morton_order
+from lardhm_torch.sampling import UNKNOWN
 
 INSIDE = 6.0  # standard deviations from a surface's cluster: nothing there is unknown ...
 SURFACE = 0.25  # [m] ... nor farther than this from its plane: wider clusters are no surfaces

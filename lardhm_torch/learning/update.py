@@ -30,9 +30,10 @@ from lardhm_torch.learning.evidence import kept_counts, kept_points, with_eviden
 from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.forgetting import doubted, forget
 from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
-from lardhm_torch.points import UNKNOWN, in_morton_order
+from lardhm_torch.sampling import UNKNOWN
 
 MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
 UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown

@@ -81,8 +81,8 @@ Tensor expected_ranges(const Tensor& given_origins, const Tensor& given_ways, do
   const Survey survey{{step, max_range, passed}, length, -std::log(negligible)};
   check_steps(survey);
   k = std::min(k, centers.size(0));
-  const Tensor results = torch::stable::new_empty(origins, {n});
-  if (k == 0) return torch::stable::fill_(results, max_range);
+  const Tensor results = new_empty(origins, {n});
+  if (k == 0) return fill(results, max_range);
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     with_parameters<T, dim()>(map, kStride * n, [&](Parameters<T, dim()>& parameters) {
@@ -95,15 +95,14 @@ Tensor expected_ranges(const Tensor& given_origins, const Tensor& given_ways, do
 }
 
 }  // namespace
+
+std::vector<Operator> expected_range_operators() {
+  return {
+      {"expected_ranges(Tensor origins, Tensor directions, float step, float max_range, "
+       "float length, float passed, float negligible, Tensor centers, Tensor raw_scale_tril, "
+       "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index) -> Tensor",
+       &boxed<expected_ranges>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "expected_ranges(Tensor origins, Tensor directions, float step, float max_range, "
-      "float length, float passed, float negligible, Tensor centers, Tensor raw_scale_tril, "
-      "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("expected_ranges", TORCH_BOX(&lardhm::expected_ranges));
-}

@@ -140,8 +140,8 @@ Tensor raycast(const Tensor& given_origins, const Tensor& given_ways, double ste
   check_rays(origins, ways, centers);
   check_steps(march);
   k = std::min(k, centers.size(0));
-  const Tensor results = torch::stable::new_empty(origins, {n});
-  if (k == 0) return torch::stable::fill_(results, kInfinity);
+  const Tensor results = new_empty(origins, {n});
+  if (k == 0) return fill(results, kInfinity);
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     with_parameters<T, dim()>(map, kStride * n, [&](Parameters<T, dim()>& parameters) {
@@ -154,13 +154,14 @@ Tensor raycast(const Tensor& given_origins, const Tensor& given_ways, double ste
 }
 
 }  // namespace
-}  // namespace lardhm
 
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "raycast(Tensor origins, Tensor directions, float step, float max_range, float level, "
-      "float target, bool ridge, Tensor centers, Tensor raw_scale_tril, Tensor weights, int k, "
-      "float covariance_scale, float min_lengthscale, Tensor index) -> Tensor");
+std::vector<Operator> raycast_operators() {
+  return {
+      {"raycast(Tensor origins, Tensor directions, float step, float max_range, float level, "
+       "float target, bool ridge, Tensor centers, Tensor raw_scale_tril, Tensor weights, int k, "
+       "float covariance_scale, float min_lengthscale, Tensor index) -> Tensor",
+       &boxed<raycast>},
+  };
 }
 
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) { m.impl("raycast", TORCH_BOX(&lardhm::raycast)); }
+}  // namespace lardhm

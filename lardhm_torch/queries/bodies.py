@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, reads_map, to_tensor
 from lardhm_torch.queries.distance import signed_distance
 
 # Standard deviation of the distance, beside or as a part of the noise of the hits. Chosen on the
@@ -60,6 +60,7 @@ class Body:
         return torch.einsum("...de,se->...sd", rotations, self.centers) + places[..., None, :]
 
 
+@reads_map
 def body_distance(
     model: OccupancyMap, body: Body, poses: TensorLike, max_distance: float = math.inf
 ) -> Tensor:
@@ -83,6 +84,7 @@ def body_distance(
     return (distance - body.radii.to(distance.device)).amin(dim=-1)
 
 
+@reads_map
 def capsule_distance(
     model: OccupancyMap, starts: TensorLike, ends: TensorLike, radii: TensorLike | float = 0.0
 ) -> Tensor:
@@ -146,6 +148,7 @@ def _least_of(model: OccupancyMap, starts: Tensor, ends: Tensor, fractions: Tens
     return fractions.gather(1, least).squeeze(1)
 
 
+@reads_map
 def collision_probability(
     model: OccupancyMap, points: TensorLike, radii: TensorLike | float
 ) -> Tensor:
@@ -174,6 +177,7 @@ def collision_probability(
     return torch.special.ndtr((radii - mean) / ((NOISE_FACTOR * noise).square() + ERROR**2).sqrt())
 
 
+@reads_map
 def body_collision_probability(model: OccupancyMap, body: Body, poses: TensorLike) -> Tensor:
     """Probability that a body touches a surface: that of the sphere most likely to do so.
 

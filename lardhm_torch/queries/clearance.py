@@ -8,7 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, in_memory, num_neighbors, to_tensor
+from lardhm_torch.maps import (
+    OccupancyMap,
+    TensorLike,
+    in_memory,
+    num_neighbors,
+    reads_map,
+    to_tensor,
+)
 from lardhm_torch.queries.faces import kernel_tensors, surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
 from lardhm_torch.queries.nearest_face import (
@@ -25,6 +32,7 @@ NEARLY = 0.5  # log-odds below those of an obstacle by no more count as one: it 
 CHUNK_POINTS = 1 << 17
 
 
+@reads_map
 def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -> Tensor:
     """Lower bound on the distance to the nearest obstacle; differentiable.
 

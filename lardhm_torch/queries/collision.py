@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map, to_tensor
 from lardhm_torch.queries.hazard import HAZARD_LENGTH, sphere_points, swept_integral
 from lardhm_torch.queries.marching import Rays, expected_lengths
 from lardhm_torch.queries.raycasting import surface_step, unit_rays
@@ -39,6 +39,7 @@ class Mover:
             raise ValueError(f"step must be > 0 m; got {self.step}")
 
 
+@reads_map
 def segment_hazard(
     model: OccupancyMap, starts: TensorLike, ends: TensorLike, mover: Mover | None = None
 ) -> Tensor:
@@ -79,6 +80,7 @@ def segment_hazard(
     return result
 
 
+@reads_map
 def free_probability(
     model: OccupancyMap, starts: TensorLike, ends: TensorLike, mover: Mover | None = None
 ) -> Tensor:
@@ -101,6 +103,7 @@ def free_probability(
     return torch.exp(-segment_hazard(model, starts, ends, mover))
 
 
+@reads_map
 def expected_range(
     model: OccupancyMap,
     origins: TensorLike,

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, to_tensor
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map, to_tensor
 from lardhm_torch.queries.faces import surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, cluster_boxes
 from lardhm_torch.queries.nearest_face import to_nearest
@@ -16,6 +16,7 @@ MARGIN = 1.0  # [m] around a box: clusters of the faces in it
 FIRST_REACH = 4.0  # [m] how far a tiled map looks first
 
 
+@reads_map
 def signed_distance(
     model: OccupancyMap,
     points: TensorLike,
@@ -64,6 +65,7 @@ def signed_distance(
     return ask(model, flat, max_distance, to_mean).reshape(points.shape[:-1]).to(dtype)
 
 
+@reads_map
 def surface_distance(
     model: OccupancyMap, points: TensorLike, max_distance: float = math.inf
 ) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts
+from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map
 from lardhm_torch.queries.hazard import NEGLIGIBLE, reached
 from lardhm_torch.queries.raycasting import unit_rays
 
@@ -22,6 +22,7 @@ NEIGHBORS = 8  # rays that tell how densely rays lie
 
 
 @torch.no_grad()
+@reads_map
 def information_gain(
     model: OccupancyMap,
     origin: TensorLike,

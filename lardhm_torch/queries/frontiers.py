@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, TensorLike
+from lardhm_torch.maps import OccupancyMap, TensorLike, reads_map
 from lardhm_torch.queries.grids import EVIDENCE, grid_axes, lattice_values
 
 WALL_MARGIN = 0.3  # [m] around obstacles, where log-odds pass from free to occupied
@@ -29,6 +29,7 @@ class Frontiers(NamedTuple):
 
 
 @torch.no_grad()
+@reads_map
 def frontiers(
     model: OccupancyMap,
     lower: TensorLike,

@@ -14,6 +14,7 @@ from lardhm_torch.maps import (
     local_parts,
     native_lattice,
     pieces,
+    reads_map,
     to_tensor,
 )
 from lardhm_torch.native import build_index, nearest_centers
@@ -109,6 +110,7 @@ def grid_axes(
     ]
 
 
+@reads_map
 def query_grid(
     model: OccupancyMap, lower: TensorLike, upper: TensorLike, resolution: float
 ) -> Tensor:
@@ -158,6 +160,7 @@ def lattice_values(model: OccupancyMap, axes: list[Tensor], *, probability: bool
     return result.reshape(shape)
 
 
+@reads_map
 def query_slice(
     model: OccupancyMap,
     height: float | None = None,
@@ -196,6 +199,7 @@ def query_slice(
 
 
 @torch.no_grad()
+@reads_map
 def map_bounds(model: OccupancyMap, margin: float = 0.0) -> tuple[Tensor, Tensor]:
     """Axis-aligned bounding box of all clusters, three standard deviations around each.
 
@@ -273,6 +277,7 @@ def nearest_support(model: OccupancyMap, points: Tensor, sign: int) -> Support:
     return support
 
 
+@reads_map
 def occupancy_gradient(model: OccupancyMap, points: TensorLike) -> Tensor:
     """Gradient of the log-odds, which points into obstacles.
 

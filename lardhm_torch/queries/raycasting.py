@@ -17,6 +17,7 @@ from lardhm_torch.maps import (
     TensorLike,
     local_parts,
     native_ranges,
+    reads_map,
     stored_thickness_counts,
     to_tensor,
 )
@@ -38,6 +39,7 @@ class March(NamedTuple):
 
 
 @torch.no_grad()
+@reads_map
 def raycast(
     model: OccupancyMap,
     origins: TensorLike,

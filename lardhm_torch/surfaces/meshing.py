@@ -15,6 +15,7 @@ from lardhm_torch.maps import (
     channel_names,
     log_odds_variance,
     pieces,
+    reads_copy,
     to_tensor,
 )
 from lardhm_torch.queries.grids import (
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
+@reads_copy
 def extract_mesh(
     model: OccupancyMap,
     resolution: float = 0.05,

@@ -31,7 +31,7 @@ from lardhm_torch.learning.clustering import (
 )
 from lardhm_torch.learning.fitting import FitConfig, class_factors, fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.tiles.indexing import Index
 from lardhm_torch.tiles.ledger import Counts
 from lardhm_torch.tiles.records import OCCUPIED, TilePoints

@@ -29,7 +29,7 @@ from lardhm_torch.io.octrees import to_array
 from lardhm_torch.learning.clustering import clusters_from_moments, mini_batch_kmeans
 from lardhm_torch.learning.fitting import fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
-from lardhm_torch.points import in_morton_order
+from lardhm_torch.learning.points import in_morton_order
 
 NUM_CLUSTERS, NUM_NEIGHBORS, RESOLUTION = 500, 5, 0.05
 NUM_POINTS, NUM_QUERIES = 82_842, 638_683

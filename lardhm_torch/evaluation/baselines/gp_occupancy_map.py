@@ -16,7 +16,7 @@ from lardhm_torch.evaluation.baselines.gaussian_process import (
     squared_exponential,
     squash,
 )
-from lardhm_torch.points import check_samples
+from lardhm_torch.learning.points import check_samples
 
 MAX_POINTS = 8000  # the covariance matrix is half a gigabyte, its factor takes 10^11.5 operations
 LEARNING_POINTS = 300  # random points from which the hyperparameters are learned

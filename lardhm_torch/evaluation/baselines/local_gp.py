@@ -19,8 +19,8 @@ from lardhm_torch.evaluation.baselines.gaussian_process import (
     squash,
 )
 from lardhm_torch.learning.clustering import mini_batch_kmeans
+from lardhm_torch.learning.points import check_samples, in_morton_order
 from lardhm_torch.native import nearest_centers
-from lardhm_torch.points import check_samples, in_morton_order
 
 LEARNING_CLUSTERS = 32  # random clusters from which the hyperparameters are learned
 LEARNING_POINTS = 128  # largest number of points of each of them that is used

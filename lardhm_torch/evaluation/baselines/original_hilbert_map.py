@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.learning.fitting import FitConfig, fit_weights, stratified_batches
-from lardhm_torch.points import check_samples, in_morton_order
+from lardhm_torch.learning.points import check_samples, in_morton_order
 
 SUPPORT_RADIUS = 2.5  # [cells] kernels are truncated here, at exp(-2.5^2 / 2) = 4 % of the peak
 # for a lengthscale of one cell
