@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
 from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
+from lardhm_torch.crossings import Lines, never_crossed, passages
 from lardhm_torch.scans import Scans
 
 UNKNOWN = 0.5  # label of points in unobserved space
-TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
-PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
 LOST = 0.5  # of the hits outside the range limits: more than that is a mistake of units
 
 
@@ -35,6 +32,8 @@ class SamplingConfig:
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
     behind_samples: int = 1  # unknown samples behind each hit, between the same two
+    # free samples where a ray passes through a flat surface that other rays hit; one elsewhere
+    passing_samples: int = 2
     cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
 
     def __post_init__(self) -> None:
@@ -52,6 +51,8 @@ class SamplingConfig:
                 "behind_samples must be 0 or more and cell_edge > 0; "
                 f"got {self.behind_samples} and {self.cell_edge}"
             )
+        if self.passing_samples < 0:
+            raise ValueError(f"passing_samples must be 0 or more; got {self.passing_samples}")
         if not 0 <= self.near_margin < self.near_reach:
             raise ValueError(
                 "near_margin and near_reach must satisfy 0 <= near_margin < near_reach; "
@@ -152,8 +153,10 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
     longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
-    returns of a pulse (``target_index`` > 1) give a hit but no free space. Behind each hit lie
-    ``behind_samples`` points of label 1/2, those of them where no other ray went.
+    returns of a pulse (``target_index`` > 1) give a hit but no free space. Where a ray passes through a
+    surface that other rays hit (`crossings.passages`), as in an open door, lie ``passing_samples`` more
+    free points. Behind each hit lie ``behind_samples`` points of label 1/2, those of them where no other
+    ray went.
 
     Args:
         scans: range scans, world frame.
@@ -209,16 +212,56 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     labels[: len(hits)] = 1
     known = Samples(points, labels, ray_id, dropped)
     channels = select_channels(scans.channels, hit_rays)
-    if not config.behind_samples:
-        return _with_channels(known, channels)
     seen = _rows(first)
-    lines = _Lines(
+    lines = Lines(
         starts if len(starts) == 1 else _taken(starts, seen),
         _taken(ahead, seen),
-        _taken(torch.where(is_hit, free_end, reach), seen),
+        _taken(free_end, seen),
     )
-    samples = _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+    samples = known
+    if config.passing_samples:
+        whole = lines._replace(reach=_taken(reach, seen))
+        passing = seeded_generator(seed, "passing", ranges.device)
+        samples = _with_passing(
+            samples, len(hits), whole, lines.reach, _taken(rays, seen), config, passing
+        )
+    if config.behind_samples:
+        samples = _with_unknown(samples, _taken(ahead, hits), lines, config, rng)
     return _with_channels(samples, channels)
+
+
+def _with_passing(
+    known: Samples,
+    num_hits: int,
+    lines: Lines,
+    ends: Tensor,
+    ray_id: Tensor,
+    config: SamplingConfig,
+    rng: torch.Generator,
+) -> Samples:
+    """The samples and, after them, free points where rays pass through surfaces (`passages`).
+
+    Args:
+        known: occupied and free samples, the hits first.
+        num_hits: number of hits.
+        lines: R rays, as far as the hit of each.
+        ends: (R,) depths before which space is free [m].
+        ray_id: (R,) their numbers.
+        config: how many, and how far behind a surface a ray must end.
+        rng: random state.
+    """
+    found = passages(known.points[:num_hits], lines, ends, config.near_reach)
+    counts = torch.where(found.is_flat, config.passing_samples, 1)
+    rays, depths, widths = (column.repeat_interleave(counts) for column in found[:3])
+    place = torch.rand(len(rays), generator=rng, device=rng.device, dtype=depths.dtype)
+    depths = (depths + widths * (2 * place - 1)).clamp(min=0).minimum(ends[rays])
+    starts = lines.starts if len(lines.starts) == 1 else lines.starts[rays]
+    return replace(
+        known,
+        points=torch.cat([known.points, starts + depths[:, None] * lines.ahead[rays]]),
+        labels=torch.cat([known.labels, known.labels.new_zeros(len(rays))]),
+        ray_id=torch.cat([known.ray_id, ray_id[rays]]),
+    )
 
 
 def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
@@ -228,16 +271,8 @@ def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
     return replace(samples, channels=pad_channels(of_hits, len(samples)))
 
 
-class _Lines(NamedTuple):
-    """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
-
-    starts: Tensor
-    ahead: Tensor
-    reach: Tensor
-
-
 def _with_unknown(
-    known: Samples, ahead: Tensor, lines: _Lines, config: SamplingConfig, rng: torch.Generator
+    known: Samples, ahead: Tensor, lines: Lines, config: SamplingConfig, rng: torch.Generator
 ) -> Samples:
     """The samples and, after them, unknown points behind the hits, where no ray went.
 
@@ -302,68 +337,6 @@ def _rows(mask: Tensor) -> Tensor:
 def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
     """``tensor[rows]`` of rows that ascend: the tensor itself, not copied, where they are all."""
     return tensor if len(rows) == len(tensor) else tensor.index_select(0, rows)
-
-
-def table_entry(cells: Tensor) -> Tensor:
-    """(..., D) numbers of cells, int64 -> (...) entry of the table that each has, int64."""
-    entry = cells[..., 0] * PRIMES[0]
-    for axis in range(1, cells.shape[-1]):
-        entry = entry ^ (cells[..., axis] * PRIMES[axis % len(PRIMES)])
-    return entry & ((1 << TABLE_BITS) - 1)
-
-
-def never_crossed(
-    points: Tensor, starts: Tensor, ahead: Tensor, reach: Tensor, edge: float
-) -> Tensor:
-    """(N, D) positions -> (N,) bool: no ray went through the cell.
-
-    Each ray is followed in steps of a cell's edge. Cells that a ray cuts by less than a corner may
-    be missed, and a place that shares its entry of the table with a crossed cell is held to be
-    crossed: that is rare, and costs a sample.
-
-    Args:
-        points: (N, D) positions [m].
-        starts: (R, D), or (1, D) where all are one, origins of the rays [m].
-        ahead: (R, D) their directions, of length 1.
-        reach: (R,) how far each was seen to go [m].
-        edge: of the cells [m].
-    """
-    if len(reach) == 0:
-        return torch.ones(len(points), dtype=torch.bool, device=points.device)
-    corner = starts.mean(dim=0)
-    cells = ((points - corner) / edge).floor().long()
-    begins = (starts - corner) / edge
-    whole = begins.floor()
-    # float32 serves along a ray: it counts from the border of the cell where the ray begins
-    rays = (whole.long(), (begins - whole).float(), ahead.float(), (reach / edge).long() + 1)
-    if native.supports(points):
-        return torch.ops.lardhm.unmarked_cells(cells, *rays)
-    return unmarked_cells(cells, *rays)
-
-
-def unmarked_cells(
-    cells: Tensor, starts: Tensor, inside: Tensor, ways: Tensor, steps: Tensor
-) -> Tensor:
-    """(N, D) numbers of cells -> (N,) bool: no ray marked the cell's entry of the table.
-
-    Args:
-        cells: (N, D) int64.
-        starts: (R, D) or (1, D) int64, cells where the rays begin.
-        inside: of the same shape, float32, where in them, in units of a cell.
-        ways: (R, D) float32 directions, of length 1.
-        steps: (R,) int64, how many cells on each ray is followed.
-    """
-    marked = torch.zeros(1 << TABLE_BITS, dtype=torch.bool, device=cells.device)
-    order = steps.argsort()
-    ends, ways = steps[order], ways[order]
-    if len(starts) > 1:
-        starts, inside = starts[order], inside[order]
-    first = torch.searchsorted(ends, torch.arange(int(ends[-1]), device=ends.device), right=True)
-    for step, begin in enumerate(first.tolist()):  # the rays that go farther
-        rows = slice(begin if len(starts) > 1 else 0, None)
-        along = inside[rows] + ways[begin:] * (step + 0.5)  # two roundings, everywhere the same
-        marked[table_entry(starts[rows] + along.floor().long())] = True
-    return ~marked[table_entry(cells)]
 
 
 def seeded_generator(
