@@ -124,7 +124,7 @@ def simulate_room(
 
     Returns:
         Scans with three origins, in the world frame, with the channels "color" and "class" (an index
-        into `materials.CLASS_NAMES`).
+        into `CLASS_NAMES`).
 
     Raises:
         ValueError: num_rays is below 3, noise or exposure_noise is negative, or wrong_labels is not

@@ -23,12 +23,13 @@ FLAGS = (
 )  # fmt: skip
 ARM = platform.machine() in ("aarch64", "arm64")
 FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
-# Sources that are compiled together, the longest job first. Torch's headers take a second a unit: the
-# last two do without.
+# Sources that are compiled together, the longest job first. The standard library's headers take a second
+# a unit, torch's, which only the last includes, two more.
 UNITS = (
     ("query", "kmeans", "gradients", "descent", "mixture", "tuning"),
     (
         "raycast",
+        "expected_range",
         "update",
         "pooling",
         "evidence",
@@ -36,10 +37,10 @@ UNITS = (
         "passages",
         "marching",
         "ridge",
-        "threads",
     ),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
+    ("bindings", "threads"),
 )
 LONGEST = 1800  # [s] for one unit, on a slow and busy machine
 COMPILERS = ("c++", "g++", "clang++")

@@ -2,10 +2,10 @@
 // followed through the boxes of its leaves.
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -68,7 +68,7 @@ Tensor balanced_order(const Tensor& given, int64_t levels) {
         "points must be (N, 2) or (N, 3), float64");
   check(levels >= 0 && levels < 40, "levels must be 0 to 39");
   const int64_t count = points.size(0);
-  const Tensor order = torch::stable::new_empty(points, {count}, ScalarType::Long);
+  const Tensor order = new_empty(points, {count}, ScalarType::Long);
   if (points.size(1) == 2)
     divide<2>(doubles(points), count, levels, out<int64_t>(order));
   else
@@ -208,7 +208,7 @@ void check_patches(const Tensor& ahead, const Tensor& low, const Tensor& high,
         "precisions must be (L, D, D), distances (L,)");
 }
 
-std::tuple<Tensor, Tensor> passing(Tensor starts, Tensor ahead, Tensor reach, Tensor ends,
+std::array<Tensor, 2> passing(Tensor starts, Tensor ahead, Tensor reach, Tensor ends,
                                    Tensor low, Tensor high, Tensor means, Tensor precisions,
                                    Tensor normals, Tensor clear, double limit) {
   for (Tensor* part : {&starts, &ahead, &reach, &ends, &low, &high, &means, &precisions, &normals,
@@ -232,8 +232,8 @@ std::tuple<Tensor, Tensor> passing(Tensor starts, Tensor ahead, Tensor reach, Te
                                                       : run(std::integral_constant<int, 3>{});
   int64_t count = 0, row = 0;
   for (const Pairs& part : found) count += int64_t(part.size());
-  const Tensor which = torch::stable::new_empty(ahead, {count}, ScalarType::Long);
-  const Tensor leaves = torch::stable::new_empty(ahead, {count}, ScalarType::Long);
+  const Tensor which = new_empty(ahead, {count}, ScalarType::Long);
+  const Tensor leaves = new_empty(ahead, {count}, ScalarType::Long);
   for (const Pairs& part : found)
     for (const auto& pair : part) {
       out<int64_t>(which)[row] = pair.first;
@@ -245,15 +245,16 @@ std::tuple<Tensor, Tensor> passing(Tensor starts, Tensor ahead, Tensor reach, Te
 }  // namespace
 }  // namespace lardhm::passages
 
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def("balanced_order(Tensor points, int levels) -> Tensor");
-  m.def(
-      "passing(Tensor starts, Tensor ahead, Tensor reach, Tensor ends, Tensor low, Tensor high, "
-      "Tensor means, Tensor precisions, Tensor normals, Tensor clear, float limit) -> (Tensor, "
-      "Tensor)");
+namespace lardhm {
+
+std::vector<Operator> passages_operators() {
+  return {
+      {"balanced_order(Tensor points, int levels) -> Tensor", &boxed<passages::balanced_order>},
+      {"passing(Tensor starts, Tensor ahead, Tensor reach, Tensor ends, Tensor low, Tensor high, "
+       "Tensor means, Tensor precisions, Tensor normals, Tensor clear, float limit) -> (Tensor, "
+       "Tensor)",
+       &boxed<passages::passing>},
+  };
 }
 
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("balanced_order", TORCH_BOX(&lardhm::passages::balanced_order));
-  m.impl("passing", TORCH_BOX(&lardhm::passages::passing));
-}
+}  // namespace lardhm

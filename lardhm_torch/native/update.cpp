@@ -76,10 +76,10 @@ Tensor nearest_clusters(const Tensor& given_points, const Tensor& given_counts,
   check_moments(counts, means, scatters, means);
   const int64_t count = means.size(0), n = points.size(0);
   check(count > 0, "there must be at least one cluster");
-  const Tensor weights = torch::stable::new_zeros(means, {count});
-  const Tensor no_index = torch::stable::new_empty(means, {0}, ScalarType::Byte);
-  const Tensor raw = torch::stable::new_empty(scatters, scatters.sizes());
-  const Tensor owners = torch::stable::new_empty(points, {n}, ScalarType::Int);
+  const Tensor weights = new_zeros(means, {count});
+  const Tensor no_index = new_empty(means, {0}, ScalarType::Byte);
+  const Tensor raw = new_empty(scatters, scatters.sizes());
+  const Tensor owners = new_empty(points, {n}, ScalarType::Int);
   dispatch(means, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -128,10 +128,10 @@ Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_po
   const Tensor points = tidy(given_points);
   check_rows("points", points, centers);
   const int64_t count = centers.size(0);
-  const Tensor weights = torch::stable::new_empty(centers, {count});
-  const Tensor no_index = torch::stable::new_empty(centers, {0}, ScalarType::Byte);
+  const Tensor weights = new_empty(centers, {count});
+  const Tensor no_index = new_empty(centers, {0}, ScalarType::Byte);
   const MapTensors map(centers, raw, weights, no_index, covariance_scale, min_lengthscale);
-  const Tensor found = torch::stable::new_empty(map.centers, {count}, ScalarType::Bool);
+  const Tensor found = new_empty(map.centers, {count}, ScalarType::Bool);
   bool* to = out<bool>(found);
   dispatch(map.centers, [&](auto type, auto dim) {
     using T = decltype(type);
@@ -150,18 +150,16 @@ Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_po
 }
 
 }  // namespace
+
+std::vector<Operator> update_operators() {
+  return {
+      {"nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
+       "float radius) -> Tensor",
+       &boxed<nearest_clusters>},
+      {"reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
+       "float covariance_scale, float min_lengthscale) -> Tensor",
+       &boxed<reaching>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
-      "float radius) -> Tensor");
-  m.def(
-      "reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
-      "float covariance_scale, float min_lengthscale) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("nearest_clusters", TORCH_BOX(&lardhm::nearest_clusters));
-  m.impl("reaching", TORCH_BOX(&lardhm::reaching));
-}
