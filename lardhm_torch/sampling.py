@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
-from lardhm_torch.native.crossing import never_crossed
+from lardhm_torch.native.crossings import Lines, never_crossed, passages
 from lardhm_torch.scans import Scans
 
 UNKNOWN = 0.5  # label of points in unobserved space
@@ -33,6 +32,8 @@ class SamplingConfig:
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
     behind_samples: int = 1  # unknown samples behind each hit, between the same two
+    # free samples where a ray passes through a flat surface that other rays hit; one elsewhere
+    passing_samples: int = 2
     cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
 
     def __post_init__(self) -> None:
@@ -50,6 +51,8 @@ class SamplingConfig:
                 "behind_samples must be 0 or more and cell_edge > 0; "
                 f"got {self.behind_samples} and {self.cell_edge}"
             )
+        if self.passing_samples < 0:
+            raise ValueError(f"passing_samples must be 0 or more; got {self.passing_samples}")
         if not 0 <= self.near_margin < self.near_reach:
             raise ValueError(
                 "near_margin and near_reach must satisfy 0 <= near_margin < near_reach; "
@@ -156,8 +159,10 @@ def sample_rays(
     Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
     longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
-    returns of a pulse (``target_index`` > 1) give a hit but no free space. Behind each hit lie
-    ``behind_samples`` points of label 1/2, those of them where no other ray went.
+    returns of a pulse (``target_index`` > 1) give a hit but no free space. Where a ray passes through a
+    surface that other rays hit (`crossings.passages`), as in an open door, lie ``passing_samples`` more
+    free points. Behind each hit lie ``behind_samples`` points of label 1/2, those of them where no other
+    ray went.
 
     Args:
         scans: range scans, world frame.
@@ -219,16 +224,56 @@ def sample_rays(
     labels[: len(hits)] = 1
     known = Samples(points, labels, ray_id, dropped)
     channels = select_channels(scans.channels, hit_rays)
-    if not config.behind_samples:
-        return _with_channels(known, channels)
     seen = _rows(first)
-    lines = _Lines(
+    lines = Lines(
         starts if len(starts) == 1 else _taken(starts, seen),
         _taken(ahead, seen),
-        _taken(torch.where(is_hit, free_end, reach), seen),
+        _taken(free_end, seen),
     )
-    samples = _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+    samples = known
+    if config.passing_samples:
+        whole = lines._replace(reach=_taken(reach, seen))
+        passing = seeded_generator(seed, "passing", ranges.device)
+        samples = _with_passing(
+            samples, len(hits), whole, lines.reach, _taken(rays, seen), config, passing
+        )
+    if config.behind_samples:
+        samples = _with_unknown(samples, _taken(ahead, hits), lines, config, rng)
     return _with_channels(samples, channels)
+
+
+def _with_passing(
+    known: Samples,
+    num_hits: int,
+    lines: Lines,
+    ends: Tensor,
+    ray_id: Tensor,
+    config: SamplingConfig,
+    rng: torch.Generator,
+) -> Samples:
+    """The samples and, after them, free points where rays pass through surfaces (`passages`).
+
+    Args:
+        known: occupied and free samples, the hits first.
+        num_hits: number of hits.
+        lines: R rays, as far as the hit of each.
+        ends: (R,) depths before which space is free [m].
+        ray_id: (R,) their numbers.
+        config: how many, and how far behind a surface a ray must end.
+        rng: random state.
+    """
+    found = passages(known.points[:num_hits], lines, ends, config.near_reach)
+    counts = torch.where(found.is_flat, config.passing_samples, 1)
+    rays, depths, widths = (column.repeat_interleave(counts) for column in found[:3])
+    place = torch.rand(len(rays), generator=rng, device=rng.device, dtype=depths.dtype)
+    depths = (depths + widths * (2 * place - 1)).clamp(min=0).minimum(ends[rays])
+    starts = lines.starts if len(lines.starts) == 1 else lines.starts[rays]
+    return replace(
+        known,
+        points=torch.cat([known.points, starts + depths[:, None] * lines.ahead[rays]]),
+        labels=torch.cat([known.labels, known.labels.new_zeros(len(rays))]),
+        ray_id=torch.cat([known.ray_id, ray_id[rays]]),
+    )
 
 
 def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
@@ -238,16 +283,8 @@ def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
     return replace(samples, channels=pad_channels(of_hits, len(samples)))
 
 
-class _Lines(NamedTuple):
-    """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
-
-    starts: Tensor
-    ahead: Tensor
-    reach: Tensor
-
-
 def _with_unknown(
-    known: Samples, ahead: Tensor, lines: _Lines, config: SamplingConfig, rng: torch.Generator
+    known: Samples, ahead: Tensor, lines: Lines, config: SamplingConfig, rng: torch.Generator
 ) -> Samples:
     """The samples and, after them, unknown points behind the hits, where no ray went.
 

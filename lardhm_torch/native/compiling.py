@@ -35,6 +35,7 @@ UNITS = (
         "evidence",
         "kept",
         "cells",
+        "passages",
         "marching",
         "ridge",
     ),
