@@ -14,11 +14,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from lardhm_torch.features import Kernel
 from lardhm_torch.io import map_files, packed_files
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.packed_blocks import decode_block, encode_block
 from lardhm_torch.io.packed_files import Packed
+from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.packed_channels import (
     check_finite,
     rounded_channels,
@@ -48,8 +51,21 @@ def rounded(model: MapParameters, precision: int = PRECISION) -> Packed:
         ValueError: the precision is out of range, a parameter of the map is not finite, or too
             large for the precision.
     """
+    return rounded_state(read_state(model), model.kernel, model.origin, precision)
+
+
+def rounded_state(
+    state: MapState, kernel: Kernel, origin: Tensor, precision: int = PRECISION
+) -> Packed:
+    """The integers of the clusters of a map, see `rounded`.
+
+    Args:
+        state: M clusters.
+        kernel: settings of the map.
+        origin: (D,) float64 origin of the map's frame [m].
+        precision: fractional bits.
+    """
     check_precision(precision)
-    state, kernel, origin = read_state(model), model.kernel, model.origin
     weights, centers, raw = (
         tensor.double().cpu().numpy()
         for tensor in (state.weights, state.centers, state.raw_scale_tril)
