@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -95,11 +96,10 @@ class LardHilbertMap(MapQueries):
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
-                leaves the remainder to the other. None: as many as the scene needs. (If there are few
-                points or a single class, `clustering.choose_num_clusters` chooses.)
+                leaves the remainder to the other. None: as many as the scene needs.
             seed: random seed of clustering and training.
             max_bytes: instead of a number of clusters, the size of the file that `pack` writes: the map
-                gets as many clusters as fit into it. Channels are not counted.
+                gets as many clusters as fit into it.
             channels: values of the points by name, such as `Samples.channels`; those of the occupied
                 points are summed up in the clusters. They do not change the occupancy.
             progress: show a progress bar on a terminal.
@@ -123,11 +123,12 @@ class LardHilbertMap(MapQueries):
             raise ValueError("num_clusters and max_bytes exclude each other; got both")
         rng = seeded_generator(seed, "fit", self.centers.device)
         task = FitTask(self.kernel, config or FitConfig(), rng, progress)
+        finish = partial(channel_sums.fitted, channels=channels, points=points, labels=labels)
         if max_bytes is None:
             state = fit_scene(samples.points, samples.labels, num_clusters, task)
         else:
-            state = fit_size(samples, max_bytes, task)
-        state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
+            state = fit_size(samples, max_bytes, task, finish, copy.deepcopy(self))
+        state, layout = finish(state, origin=samples.origin)
         with self.lock.writing():
             parameters.write_state(self, state, samples.origin, layout)
             self.class_scale = 1.0
@@ -269,7 +270,6 @@ class LardHilbertMap(MapQueries):
         """Update the map with one more scan, without forgetting.
 
         On an empty map this is `fit` with ``FitConfig(shape_passes=0)``.
-
         Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
         near them are regrouped, and the weights there are trained on the kept points. Parameters
         remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters

@@ -22,8 +22,7 @@ def add_map_size(sub: argparse.ArgumentParser) -> None:
         "--size",
         type=size_in_bytes,
         metavar="SIZE",
-        help="as many clusters as fit into a file of this size when the map is packed, such as 20kB "
-        "(without channels)",
+        help="as many clusters as fit into a file of this size when the map is packed, such as 20kB",
     )
     sub.add_argument(
         "--fast",

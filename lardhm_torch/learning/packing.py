@@ -14,14 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from lardhm_torch.features import Kernel
 from lardhm_torch.io import map_files, packed_files
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.io.packed_blocks import decode_block, encode_block
 from lardhm_torch.io.packed_files import Packed
-from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.packed_channels import (
     check_finite,
     rounded_channels,
@@ -51,21 +48,8 @@ def rounded(model: MapParameters, precision: int = PRECISION) -> Packed:
         ValueError: the precision is out of range, a parameter of the map is not finite, or too
             large for the precision.
     """
-    return rounded_state(read_state(model), model.kernel, model.origin, precision)
-
-
-def rounded_state(
-    state: MapState, kernel: Kernel, origin: Tensor, precision: int = PRECISION
-) -> Packed:
-    """The integers of the clusters of a map, see `rounded`.
-
-    Args:
-        state: M clusters.
-        kernel: settings of the map.
-        origin: (D,) float64 origin of the map's frame [m].
-        precision: fractional bits.
-    """
     check_precision(precision)
+    state, kernel, origin = read_state(model), model.kernel, model.origin
     weights, centers, raw = (
         tensor.double().cpu().numpy()
         for tensor in (state.weights, state.centers, state.raw_scale_tril)
@@ -166,14 +150,19 @@ def _covariances(raw: np.ndarray) -> np.ndarray:
 
 def save_packed(model: MapParameters, path: str | os.PathLike[str], precision: int) -> None:
     """Write a map as one packet that holds it whole, see `LardHilbertMap.pack`."""
+    with replaced_file(path) as partial:
+        partial.write_bytes(packed_bytes(model, precision))
+
+
+def packed_bytes(model: MapParameters, precision: int = PRECISION) -> bytes:
+    """The content of the file that `save_packed` writes."""
     packed = rounded(model, precision)
     content = packed_files.encode(packed)
     if model.channel_layout:
         check_finite(model)
         channels = rounded_channels(model, state_dict_of(packed), 1 << precision)
         content = encode_block(*channels) + content
-    with replaced_file(path) as partial:
-        partial.write_bytes(content)
+    return content
 
 
 def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:

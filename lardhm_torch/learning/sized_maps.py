@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+from collections.abc import Callable
 
-from lardhm_torch.io import packed_files
+from lardhm_torch.learning.channel_sums import Layout
 from lardhm_torch.learning.fitting import FitTask, fit_clusters
 from lardhm_torch.learning.map_state import MapState
-from lardhm_torch.learning.packing import rounded_state
+from lardhm_torch.learning.packing import packed_bytes
+from lardhm_torch.learning.parameters import MapParameters, write_state
 from lardhm_torch.learning.points import TrainingPoints
 from lardhm_torch.learning.scene_clusters import fit_shapes, is_learnable
 
@@ -18,7 +19,13 @@ CAUTION = 0.98  # of the next attempt: bytes per cluster vary by a few percent
 ATTEMPTS = 6
 
 
-def fit_size(samples: TrainingPoints, max_bytes: int, task: FitTask) -> MapState:
+def fit_size(
+    samples: TrainingPoints,
+    max_bytes: int,
+    task: FitTask,
+    finish: Callable[..., tuple[MapState, Layout]],
+    draft: MapParameters,
+) -> MapState:
     """The map with the most clusters whose packed file has at most ``max_bytes``.
 
     The number of clusters is found in a few attempts. It is limited by the number of points, so the
@@ -28,6 +35,8 @@ def fit_size(samples: TrainingPoints, max_bytes: int, task: FitTask) -> MapState
         samples: points in the map's frame, in Morton order.
         max_bytes: size of the file.
         task: kernel, settings, random generator.
+        finish: function of a state and ``origin`` that adds the channels.
+        draft: a map with these settings, which is overwritten to measure its size.
 
     Raises:
         ValueError: max_bytes is too small.
@@ -37,7 +46,9 @@ def fit_size(samples: TrainingPoints, max_bytes: int, task: FitTask) -> MapState
     best: MapState | None = None
     for _ in range(ATTEMPTS):
         state = _fitted(samples, count, task)
-        size = packed_bytes(state, samples.origin, task)
+        complete, layout = finish(state, origin=samples.origin)
+        write_state(draft, complete, samples.origin, layout)
+        size = len(packed_bytes(draft))
         gains = best is None or len(state) > len(best)
         if size <= max_bytes and gains:
             best = state
@@ -57,11 +68,6 @@ def check_size(max_bytes: int) -> None:
         raise ValueError(
             f"max_bytes must be a whole number of bytes, at least {SMALLEST}; got {max_bytes!r}"
         )
-
-
-def packed_bytes(state: MapState, origin: Tensor, task: FitTask) -> int:
-    """Size of the packed file of a map."""
-    return len(packed_files.encode(rounded_state(state, task.kernel, origin)))
 
 
 def _fitted(samples: TrainingPoints, count: int, task: FitTask) -> MapState:
