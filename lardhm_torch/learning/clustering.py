@@ -99,14 +99,18 @@ def max_singletons(num_points: int) -> int:
 
 
 def cluster_classes(
-    points: Tensor, labels: Tensor, num_clusters: int | None, rng: torch.Generator
+    points: Tensor,
+    labels: Tensor,
+    num_clusters: int | Sequence[int] | None,
+    rng: torch.Generator,
 ) -> tuple[Clusters, Tensor]:
     """Cluster occupied and free points separately, which works better (paper, Section II-B).
 
     Args:
         points: (N, D) positions [m], in the order of `morton_order`.
         labels: (N,) 1 occupied, 0 free, 1/2 unknown.
-        num_clusters: total over all classes; None: chosen from the data.
+        num_clusters: total over all classes, or one number for each class; None: chosen from the
+            data.
         rng: random generator.
 
     Returns:
@@ -116,6 +120,8 @@ def cluster_classes(
     if num_clusters is None:
         chosen = choose_num_clusters(next(members for members in classes if len(members)))
         totals = [chosen * ratio for ratio in class_ratios(len(classes[2]))]
+    elif isinstance(num_clusters, Sequence):
+        totals = list(num_clusters)
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
     return cluster_each(classes, totals, rng)

@@ -166,7 +166,7 @@ def _still_unknown(
 def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None) -> int:
     """Number of occupied clusters up to which those near a scan are divided.
 
-    It is the number that `fit` would use for the points that they have received so far.
+    It is the number that `clustering.choose_num_clusters` gives for the points that they have received.
     """
     if num_clusters is not None:
         return num_clusters // 4
