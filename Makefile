@@ -24,6 +24,7 @@ LONG := tests/test_streaming.py::test_a_stream_killed_at_any_moment_ends_as_if_i
 	tests/test_tiles_fitting.py::test_killed_at_a_random_moment_the_job_ends_with_the_same_files \
 	tests/test_docs.py::test_the_documentation_builds_without_a_warning \
 	tests/test_io_broken.py::test_fifty_broken_files_of_each_format_neither_crash_nor_hang \
+	tests/test_gpu_check.py::test_tensors_on_another_device_are_found_with_the_line_that_made_them \
 	tests/test_class_training.py::test_classes_without_occupancy_are_told_apart_as_by_logistic_regression_on_rbf \
 	tests/test_torch_func.py::test_an_exported_map_loads_in_a_new_process \
 	tests/test_collision.py::test_gradients_pass_gradcheck_for_ways_and_for_the_map \

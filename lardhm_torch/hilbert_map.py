@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,9 +22,11 @@ from lardhm_torch.learning import (
 )
 from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clustering import check_num_clusters
-from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
+from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.map_state import HISTORY
 from lardhm_torch.learning.points import training_points
+from lardhm_torch.learning.scene_clusters import fit_scene
+from lardhm_torch.learning.sized_maps import fit_size
 from lardhm_torch.learning.state_dicts import occupied_sums
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
@@ -77,6 +80,7 @@ class LardHilbertMap(MapQueries):
         num_clusters: int | None = None,
         *,
         seed: int = 0,
+        max_bytes: int | None = None,
         channels: Channels | None = None,
         progress: bool = False,
         config: FitConfig | None = None,
@@ -84,15 +88,18 @@ class LardHilbertMap(MapQueries):
         """Fit the map to labelled points. Existing clusters are discarded.
 
         Each class is clustered separately. The moments of the clusters determine centers and
-        length-scales, and then the weights are trained. If anything fails, the map is unchanged.
+        length-scales, and then the weights are trained. Unless the number of clusters is given, the
+        scene determines it, and centers and length-scales are trained, too (`scene_clusters`). If
+        anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
-                leaves the remainder to the other. None: chosen from the data
-                (`clustering.choose_num_clusters`).
+                leaves the remainder to the other. None: as many as the scene needs.
             seed: random seed of clustering and training.
+            max_bytes: instead of a number of clusters, the size of the file that `pack` writes: the map
+                gets as many clusters as fit into it.
             channels: values of the points by name, such as `Samples.channels`; those of the occupied
                 points are summed up in the clusters. They do not change the occupancy.
             progress: show a progress bar on a terminal.
@@ -103,7 +110,8 @@ class LardHilbertMap(MapQueries):
 
         Raises:
             ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points,
-                num_clusters is not a positive integer, or a channel is invalid.
+                num_clusters is not a positive integer, max_bytes is too small or given together with
+                num_clusters, or a channel is invalid.
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
@@ -111,10 +119,16 @@ class LardHilbertMap(MapQueries):
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers)
         check_num_clusters(num_clusters)
+        if max_bytes is not None and num_clusters is not None:
+            raise ValueError("num_clusters and max_bytes exclude each other; got both")
         rng = seeded_generator(seed, "fit", self.centers.device)
         task = FitTask(self.kernel, config or FitConfig(), rng, progress)
-        state = fit_clusters(samples.points, samples.labels, num_clusters, task)
-        state, layout = channel_sums.fitted(state, channels, points, labels, samples.origin)
+        finish = partial(channel_sums.fitted, channels=channels, points=points, labels=labels)
+        if max_bytes is None:
+            state = fit_scene(samples.points, samples.labels, num_clusters, task)
+        else:
+            state = fit_size(samples, max_bytes, task, finish, copy.deepcopy(self))
+        state, layout = finish(state, origin=samples.origin)
         with self.lock.writing():
             parameters.write_state(self, state, samples.origin, layout)
             self.class_scale = 1.0
@@ -253,8 +267,9 @@ class LardHilbertMap(MapQueries):
         channels: Channels | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
-        """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
+        """Update the map with one more scan, without forgetting.
 
+        On an empty map this is `fit` with ``FitConfig(shape_passes=0)``.
         Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
         near them are regrouped, and the weights there are trained on the kept points. Parameters
         remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
@@ -283,7 +298,10 @@ class LardHilbertMap(MapQueries):
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
-            return self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+            start = FitConfig(shape_passes=0)  # later scans divide the clusters where they must
+            return self.fit(
+                points, labels, num_clusters, seed=seed, channels=channels, config=start
+            )
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)

@@ -193,6 +193,16 @@ def test_fit_takes_settings(folder):
     assert 50 <= len(model) <= 60
 
 
+def test_fit_makes_a_map_of_a_size_and_one_without_trained_shapes(folder):
+    run("fit", folder / "train.npz", "--size", "2kB", "-o", folder / "sized.pt")
+    run("pack", folder / "sized.pt", "-o", folder / "sized.lhm")
+    assert 1700 < (folder / "sized.lhm").stat().st_size <= 2000
+    run("fit", folder / "train.npz", "--fast", "-o", folder / "fast.pt")
+    fast = LardHilbertMap.load(folder / "fast.pt")
+    assert torch.equal(fast.centers, fast.means)
+    assert len(fast) > len(LardHilbertMap.load(folder / "map.pt"))
+
+
 def test_flat_scans_make_a_two_dimensional_map_on_request(tmp_path):
     angle = torch.linspace(0, 6.28, 800, dtype=torch.float64)
     ends = torch.stack([3 * angle.cos(), 2 * angle.sin(), torch.full_like(angle, 0.5)], dim=1)
@@ -326,6 +336,10 @@ def test_what_are_no_scans_is_an_error_of_one_line(bad, monkeypatch, capsys, com
         ("view map.pt --export v.html --port 99999", "--port must be 1 to 65535"),
         ("view map.pt --export v.html --host 203.0.113.1", "must be an address of this machine"),
         ("fit scans.npz -o o.pt --clusters 0", "num_clusters must be"),
+        ("fit scans.npz -o o.pt --size 100B", "max_bytes must be a whole number"),
+        ("fit scans.npz -o o.pt --size 2kB --clusters 9", "exclude each other"),
+        ("fit scans.npz -o o.pt --size 2kB --tune", "--size cannot be used with --tune"),
+        ("fit scans.npz -o o.pt --fast --incremental", "cannot be used with --incremental"),
         ("fit scans.npz -o o.pt --neighbors 0", "num_neighbors must be"),
         ("fit scans.npz -o o.pt --dim 0", "0 coordinates; got 3"),
         ("fit scans.npz -o o.pt --resume", "need --incremental"),

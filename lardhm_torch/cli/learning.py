@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lardhm_torch.cli.map_size import check_not_incremental, fit_settings
 from lardhm_torch.cli.outputs import MAP_SUFFIXES, SCAN_OUTPUTS, check_output
 from lardhm_torch.cli.scan_files import (
     far_hits,
@@ -68,6 +69,7 @@ def fit(arguments: argparse.Namespace) -> None:
         if (path := getattr(arguments, option)) is not None:
             check_output(path, (LOGS[option],), arguments.scans, option=f"--{option}")
     if arguments.incremental:
+        check_not_incremental(arguments)
         _fit_incrementally(arguments)
     else:
         _fit_at_once(arguments)
@@ -95,10 +97,10 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     model.fit(
         samples.points,
         samples.labels,
-        arguments.clusters,
         seed=arguments.seed,
         channels=samples.channels,
         progress=True,
+        **fit_settings(arguments),
     )
     if arguments.tune or arguments.tune_state:
         _tune(model, scans, samples, state, arguments)

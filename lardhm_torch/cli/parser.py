@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from lardhm_torch.cli import learning, queries, tiling
+from lardhm_torch.cli.map_size import add_map_size
 from lardhm_torch.cli.scan_arguments import add_ranges, add_reading, add_scans, finite
 
 MAP = "map file, or folder of a tiled map"
@@ -81,7 +82,7 @@ def _scan_verbs(verb: Any) -> None:
 def _fit(sub: argparse.ArgumentParser) -> None:
     add_scans(sub)
     _output(sub, "map to write: .pt, .pth or .safetensors")
-    _clusters(sub, "total number of clusters (default: chosen from the data)")
+    add_map_size(sub)
     _neighbors(sub)
     sub.add_argument(
         "--tune",
@@ -167,7 +168,8 @@ def _update(sub: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="map to write, which may be MAP itself; omit it for a tiled map, which is updated in place",
     )
-    _clusters(sub, "most clusters near a scan (default: chosen from the data)")
+    text = "most clusters near a scan (default: chosen from the data)"
+    sub.add_argument("--clusters", type=int, metavar="N", help=text)
     _radius(sub)
     add_ranges(sub)
     _seed(sub)
@@ -319,10 +321,6 @@ def _tile_verbs(verb: Any) -> None:
 
 def _output(sub: argparse.ArgumentParser, text: str) -> None:
     sub.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
-
-
-def _clusters(sub: argparse.ArgumentParser, text: str) -> None:
-    sub.add_argument("--clusters", type=int, metavar="N", help=text)
 
 
 def _neighbors(sub: argparse.ArgumentParser) -> None:

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.learning.points import morton_order
+from lardhm_torch.learning.points import count_cells, morton_order
 from lardhm_torch.native import nearest_centers
+from lardhm_torch.sampling import spread_rows
 
 POINTS_PER_CLUSTER = 15  # minimum mean number of points per cluster in `choose_num_clusters`
 DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the noise
@@ -98,14 +99,18 @@ def max_singletons(num_points: int) -> int:
 
 
 def cluster_classes(
-    points: Tensor, labels: Tensor, num_clusters: int | None, rng: torch.Generator
+    points: Tensor,
+    labels: Tensor,
+    num_clusters: int | Sequence[int] | None,
+    rng: torch.Generator,
 ) -> tuple[Clusters, Tensor]:
     """Cluster occupied and free points separately, which works better (paper, Section II-B).
 
     Args:
         points: (N, D) positions [m], in the order of `morton_order`.
         labels: (N,) 1 occupied, 0 free, 1/2 unknown.
-        num_clusters: total over all classes; None: chosen from the data.
+        num_clusters: total over all classes, or one number for each class; None: chosen from the
+            data.
         rng: random generator.
 
     Returns:
@@ -115,6 +120,8 @@ def cluster_classes(
     if num_clusters is None:
         chosen = choose_num_clusters(next(members for members in classes if len(members)))
         totals = [chosen * ratio for ratio in class_ratios(len(classes[2]))]
+    elif isinstance(num_clusters, Sequence):
+        totals = list(num_clusters)
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
     return cluster_each(classes, totals, rng)
@@ -233,10 +240,7 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False, represented: int 
         represented: number of points that these are a sample of, if they are one.
     """
     size = max(len(points), represented)
-    cells = (points / CELL_EDGE).floor().long()
-    strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
-    # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
-    count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
+    count = count_cells(points, CELL_EDGE)
     few = min(count, max_singletons(size))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
     finest = max(size // POINTS_PER_CLUSTER, few)
@@ -323,14 +327,6 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     position = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
     place = (torch.arange(num_clusters, device=rng.device) + position) / num_clusters * along[-1]
     return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
-
-
-def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) -> Tensor:
-    """(*times, count) ascending random rows of N: one from each of ``count`` <= N equal strata."""
-    shape = (*times, count)
-    place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
-    place += torch.arange(count, device=rng.device)
-    return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
 
 def clusters_from_moments(

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch import native
+from lardhm_torch.features import Kernel
 from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.fitting import (
     balance_classes,
@@ -208,6 +209,38 @@ class TuneConfig:
             raise ValueError(f"patience needs held-out rays; got hold_out = {self.hold_out}")
 
 
+def tuned_table(start: Tensor, config: TuneConfig, kernel: Kernel) -> Table:
+    """What stays the same during a run: units relative to the cluster sizes, rates and penalties.
+
+    Args:
+        start: (M, G) parameters before tuning, see `to_rows`.
+        config: rates and penalties.
+        kernel: settings of the map.
+    """
+    _, centers, raw = from_rows(start)
+    dim = centers.shape[1]
+    size = raw.diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
+    size = kernel.covariance_scale**0.5 * size.clamp(min=kernel.min_lengthscale)
+    eye = torch.eye(dim, dtype=torch.bool, device=size.device)
+    unit = to_rows(  # size: (M, 1) mean length-scale of the kernels [m]
+        torch.ones_like(size[:, 0]),
+        size.expand(-1, dim),
+        torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),
+    )
+
+    def per_column(weight: float, center: float, scale: float) -> Tensor:
+        values = [weight] + dim * [center] + dim * (dim + 1) // 2 * [scale]
+        return torch.tensor(values, dtype=torch.float64, device=start.device)
+
+    rates = per_column(
+        config.weight_rate * config.tune_weights,
+        config.center_rate * config.tune_centers,
+        config.scale_rate * config.tune_scales,
+    )
+    penalties = per_column(config.l2, config.stiffness, config.stiffness)
+    return Table(start, unit, rates, penalties, kernel)
+
+
 class LabelledPoints(NamedTuple):
     """(N, D) positions in the map's frame [m], (N,) labels, and (N,) ray IDs."""
 
@@ -231,28 +264,8 @@ class TuningRun:
         self._start_from(to_rows(*(value.detach() for value in self.parameters_of_map())))
 
     def _start_from(self, start: Tensor) -> None:
-        model, config, dim = self.model, self.config, self.model.dim
-        size = from_rows(start)[2].diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
-        size = model.covariance_scale**0.5 * size.clamp(min=model.min_lengthscale)
-        eye = torch.eye(dim, dtype=torch.bool, device=size.device)
-        unit = to_rows(  # size: (M, 1) mean length-scale of the kernels [m]
-            torch.ones_like(size[:, 0]),
-            size.expand(-1, dim),
-            torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),
-        )
-
-        def per_column(weight: float, center: float, scale: float) -> Tensor:
-            values = [weight] + dim * [center] + dim * (dim + 1) // 2 * [scale]
-            return torch.tensor(values, dtype=torch.float64, device=start.device)
-
-        rates = per_column(
-            config.weight_rate * config.tune_weights,
-            config.center_rate * config.tune_centers,
-            config.scale_rate * config.tune_scales,
-        )
-        penalties = per_column(config.l2, config.stiffness, config.stiffness)
-        self.best, self.table = start, Table(start, unit, rates, penalties, model.kernel)
-        self.moving = Moving(*(torch.zeros_like(start) for _ in range(3)))
+        self.best, self.table = start, tuned_table(start, self.config, self.model.kernel)
+        self.moving = Moving.at_start(start)
 
     def parameters_of_map(self) -> tuple[Tensor, Tensor, Tensor]:
         """Weights, centers and raw factors of the map."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -45,6 +45,9 @@ class FitConfig:
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # loss of unknown points, relative to all others
+    # Passes that train centers and length-scales, too, where the number of clusters is learned
+    # (`scene_clusters`); 0: the number is chosen from the points alone, and the weights are trained.
+    shape_passes: int = 4
 
     def rows_per_batch(self, num_points: int) -> int:
         """Points per step: about ``batch_size``, with equally large batches in each pass."""
@@ -59,6 +62,8 @@ class FitConfig:
     def __post_init__(self) -> None:
         if self.passes is not None and self.passes < 1:
             raise ValueError(f"passes must be 1 or more, or None; got {self.passes}")
+        if self.shape_passes < 0:
+            raise ValueError(f"shape_passes must be 0 or more; got {self.shape_passes}")
         if self.batch_size is not None and self.batch_size < 1:
             raise ValueError(f"batch_size must be 1 or more; got {self.batch_size}")
         if not self.learning_rate > 0:
@@ -80,16 +85,30 @@ class FitTask(NamedTuple):
     progress: bool = False
 
 
+class Batched(NamedTuple):
+    """(N, D) points [m] and (N,) labels in the order of `stratified_batches`, and their features."""
+
+    points: Tensor
+    labels: Tensor
+    features_of: FeaturesOf
+
+
 def fit_clusters(
-    points: Tensor, labels: Tensor, num_clusters: int | None, task: FitTask
+    points: Tensor,
+    labels: Tensor,
+    num_clusters: int | Sequence[int] | None,
+    task: FitTask,
+    refine: Callable[[MapState, Batched, FitTask], MapState] | None = None,
 ) -> MapState:
     """Cluster each class of the samples separately and train the weights.
 
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
         labels: (N,) 1 occupied, 0 free, 1/2 unknown, of the points' dtype.
-        num_clusters: total over both classes; None: chosen from the data.
+        num_clusters: total over all classes, or one number for each class; None: chosen from the
+            data.
         task: kernel, settings, random generator.
+        refine: continues the training, with the samples in batches.
 
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
@@ -101,12 +120,27 @@ def fit_clusters(
     points, labels = stratified_batches(columns, batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
-    def features_of(rows: slice) -> tuple[Tensor, Tensor]:
+    def compute(rows: slice) -> tuple[Tensor, Tensor]:
         centers, factors = state.centers, state.raw_scale_tril
         return native.nearest_features(points[rows], centers, factors, task.kernel, index)
 
+    features_of = _LastFeatures(compute)
     weights = fit_weights(features_of, labels, state.weights, task.config, task.progress)
-    return replace(state, weights=weights)
+    state = replace(state, weights=weights)
+    return state if refine is None else refine(state, Batched(points, labels, features_of), task)
+
+
+class _LastFeatures:
+    """A function of rows that keeps its last result, which serves two kinds of training."""
+
+    def __init__(self, features_of: FeaturesOf) -> None:
+        self.features_of = features_of
+        self.rows, self.found = slice(0), (torch.empty(0), torch.empty(0))
+
+    def __call__(self, rows: slice) -> tuple[Tensor, Tensor]:
+        if rows != self.rows:
+            self.rows, self.found = rows, self.features_of(rows)
+        return self.found
 
 
 def stratified_batches(

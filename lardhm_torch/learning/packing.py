@@ -150,14 +150,19 @@ def _covariances(raw: np.ndarray) -> np.ndarray:
 
 def save_packed(model: MapParameters, path: str | os.PathLike[str], precision: int) -> None:
     """Write a map as one packet that holds it whole, see `LardHilbertMap.pack`."""
+    with replaced_file(path) as partial:
+        partial.write_bytes(packed_bytes(model, precision))
+
+
+def packed_bytes(model: MapParameters, precision: int = PRECISION) -> bytes:
+    """The content of the file that `save_packed` writes."""
     packed = rounded(model, precision)
     content = packed_files.encode(packed)
     if model.channel_layout:
         check_finite(model)
         channels = rounded_channels(model, state_dict_of(packed), 1 << precision)
         content = encode_block(*channels) + content
-    with replaced_file(path) as partial:
-        partial.write_bytes(content)
+    return content
 
 
 def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:

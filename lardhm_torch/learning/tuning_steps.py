@@ -27,6 +27,11 @@ class Moving(NamedTuple):
     mean: Tensor
     square: Tensor
 
+    @classmethod
+    def at_start(cls, start: Tensor) -> Moving:
+        """Before the first step from (M, G) parameters."""
+        return cls(*(torch.zeros_like(start) for _ in cls._fields))
+
 
 class Table(NamedTuple):
     """What stays the same during a run.

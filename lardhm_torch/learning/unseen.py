@@ -22,7 +22,8 @@ INSIDE = 6.0  # standard deviations from a surface's cluster: nothing there is u
 SURFACE = 0.25  # [m] ... nor farther than this from its plane: wider clusters are no surfaces
 TAILS = (2.0, 5.0)  # standard deviations from a cluster: where its tail is
 TAIL_FEATURE = 0.4  # no cluster holds a place where no feature is larger
-TAILS_PER_CLUSTER = 3
+TAILS_PER_CLUSTER = 3  # at least ...
+SAMPLES_PER_TAIL = 14  # ... and one for so many samples, so that large clusters have enough
 
 
 def off_surfaces(points: Tensor, surfaces: Clusters, floor: float) -> Tensor:
@@ -49,14 +50,14 @@ def off_surfaces(points: Tensor, surfaces: Clusters, floor: float) -> Tensor:
 
 
 def draw_tails(
-    clusters: Clusters, is_occupied: Tensor, floor: float, rng: torch.Generator
+    clusters: Clusters, is_occupied: Tensor, count: int, floor: float, rng: torch.Generator
 ) -> Tensor:
-    """(N, D) positions in the tails of the clusters [m], more where these are large.
+    """(count, D) positions in the tails of the clusters [m], more where these are large.
 
     Places are spread over space, not over clusters: a cluster is drawn as often as its volume says,
     half of them from the occupied ones, which are smaller.
     """
-    count, dim = TAILS_PER_CLUSTER * len(clusters), clusters.means.shape[1]
+    dim = clusters.means.shape[1]
     covariances = clusters.covariances
     sizes = covariances.diagonal(dim1=1, dim2=2).sum(dim=1).sqrt() + floor
     volumes = sizes**dim
@@ -96,7 +97,8 @@ def settle_unknown(
     rows = is_unknown.nonzero().squeeze(1)
     kept = ~is_unknown
     kept[rows] = off_surfaces(points[rows], surfaces, kernel.min_lengthscale)
-    tails = draw_tails(state.clusters, state.is_occupied, kernel.min_lengthscale, rng)
+    count = max(TAILS_PER_CLUSTER * len(state), len(points) // SAMPLES_PER_TAIL)
+    tails = draw_tails(state.clusters, state.is_occupied, count, kernel.min_lengthscale, rng)
     index = native.build_index(state.centers, kernel.num_neighbors)
     parameters = (state.centers, state.raw_scale_tril, kernel, index)
     features = native.nearest_features(tails, *parameters)[1].amax(dim=1)
