@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
 from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
+from lardhm_torch.native.crossings import Lines, never_crossed, passages
 from lardhm_torch.scans import Scans
 
 UNKNOWN = 0.5  # label of points in unobserved space
-TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
-PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
 LOST = 0.5  # of the hits outside the range limits: more than that is a mistake of units
 
 
@@ -35,6 +32,8 @@ class SamplingConfig:
     near_margin: float = 0.15  # [m] no free sample is closer to its own hit
     near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
     behind_samples: int = 1  # unknown samples behind each hit, between the same two
+    # free samples where a ray passes through a flat surface that other rays hit; one elsewhere
+    passing_samples: int = 2
     cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
 
     def __post_init__(self) -> None:
@@ -52,6 +51,8 @@ class SamplingConfig:
                 "behind_samples must be 0 or more and cell_edge > 0; "
                 f"got {self.behind_samples} and {self.cell_edge}"
             )
+        if self.passing_samples < 0:
+            raise ValueError(f"passing_samples must be 0 or more; got {self.passing_samples}")
         if not 0 <= self.near_margin < self.near_reach:
             raise ValueError(
                 "near_margin and near_reach must satisfy 0 <= near_margin < near_reach; "
@@ -146,19 +147,29 @@ def _check_unit(scans: Scans, keep: Tensor, config: SamplingConfig) -> None:
         )
 
 
-def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int = 0) -> Samples:
+def sample_rays(
+    scans: Scans,
+    config: SamplingConfig | None = None,
+    *,
+    seed: int = 0,
+    max_points: int | None = None,
+) -> Samples:
     """Labelled points of the scans: hits occupied, points before them free, behind them unknown.
 
     Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
     (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
     longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
-    returns of a pulse (``target_index`` > 1) give a hit but no free space. Behind each hit lie
-    ``behind_samples`` points of label 1/2, those of them where no other ray went.
+    returns of a pulse (``target_index`` > 1) give a hit but no free space. Where a ray passes through a
+    surface that other rays hit (`crossings.passages`), as in an open door, lie ``passing_samples`` more
+    free points. Behind each hit lie ``behind_samples`` points of label 1/2, those of them where no other
+    ray went.
 
     Args:
         scans: range scans, world frame.
         config: spacings and limits; the defaults serve all scenes.
         seed: of the random positions; the same seed gives the same samples.
+        max_points: maximum number of points of each label. A stratified random subset of all of them
+            is drawn, and only those points are computed. None: no limit.
 
     Returns:
         Labelled points, the hits first, with the channels of their rays.
@@ -187,11 +198,14 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     first = _taken(scans.target_index, rays) == 1
     ahead = offsets / ranges[:, None]
     rng = seeded_generator(seed, "sampling", ranges.device)
+    limits = _free_limits(int(first.sum()), int((is_hit & first).sum()), config, max_points)
     groups = [
-        _stratified_depths(first, free_end, config.free_samples, rng),
-        _near_depths(is_hit & first, free_end, config, rng),
+        _stratified_depths(_rows(first), free_end, config.free_samples, limits[0], rng),
+        _near_depths(_rows(is_hit & first), free_end, config, limits[1], rng),
     ]
     hits = _rows(is_hit)
+    if max_points is not None and max_points < len(hits) and not scans.channels:
+        hits = hits[spread_rows(len(hits), max_points, rng)]
     count = len(hits) + sum(depths.numel() for _, depths in groups)
     points, ray_id = ranges.new_empty(count, scans.dim), hits.new_empty(count)
     hit_rays = _taken(rays, hits)
@@ -199,26 +213,67 @@ def sample_rays(scans: Scans, config: SamplingConfig | None = None, *, seed: int
     begin = len(hits)
     for members, depths in groups:  # written in place: on a full scan a million points
         rows = slice(begin, begin := begin + depths.numel())
-        start = starts if scans.num_scans == 1 else _taken(starts, members)
-        along, block = _taken(ahead, members), points[rows].view(*depths.shape, scans.dim)
+        of_rays = _taken if limits[0] is None else _chosen
+        start = starts if scans.num_scans == 1 else of_rays(starts, members)
+        along, block = of_rays(ahead, members), points[rows].view(*depths.shape, scans.dim)
         for axis in range(scans.dim):  # three times as fast as all axes at once
             column = slice(axis, axis + 1)
             torch.addcmul(start[:, column], depths, along[:, column], out=block[..., axis])
-        ray_id[rows].view_as(depths).copy_(_taken(rays, members)[:, None])
+        ray_id[rows].view_as(depths).copy_(of_rays(rays, members)[:, None])
     labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
     known = Samples(points, labels, ray_id, dropped)
     channels = select_channels(scans.channels, hit_rays)
-    if not config.behind_samples:
-        return _with_channels(known, channels)
     seen = _rows(first)
-    lines = _Lines(
+    lines = Lines(
         starts if len(starts) == 1 else _taken(starts, seen),
         _taken(ahead, seen),
-        _taken(torch.where(is_hit, free_end, reach), seen),
+        _taken(free_end, seen),
     )
-    samples = _with_unknown(known, _taken(ahead, hits), lines, config, rng)
+    samples = known
+    if config.passing_samples:
+        whole = lines._replace(reach=_taken(reach, seen))
+        passing = seeded_generator(seed, "passing", ranges.device)
+        samples = _with_passing(
+            samples, len(hits), whole, lines.reach, _taken(rays, seen), config, passing
+        )
+    if config.behind_samples:
+        samples = _with_unknown(samples, _taken(ahead, hits), lines, config, rng)
     return _with_channels(samples, channels)
+
+
+def _with_passing(
+    known: Samples,
+    num_hits: int,
+    lines: Lines,
+    ends: Tensor,
+    ray_id: Tensor,
+    config: SamplingConfig,
+    rng: torch.Generator,
+) -> Samples:
+    """The samples and, after them, free points where rays pass through surfaces (`passages`).
+
+    Args:
+        known: occupied and free samples, the hits first.
+        num_hits: number of hits.
+        lines: R rays, as far as the hit of each.
+        ends: (R,) depths before which space is free [m].
+        ray_id: (R,) their numbers.
+        config: how many, and how far behind a surface a ray must end.
+        rng: random state.
+    """
+    found = passages(known.points[:num_hits], lines, ends, config.near_reach)
+    counts = torch.where(found.is_flat, config.passing_samples, 1)
+    rays, depths, widths = (column.repeat_interleave(counts) for column in found[:3])
+    place = torch.rand(len(rays), generator=rng, device=rng.device, dtype=depths.dtype)
+    depths = (depths + widths * (2 * place - 1)).clamp(min=0).minimum(ends[rays])
+    starts = lines.starts if len(lines.starts) == 1 else lines.starts[rays]
+    return replace(
+        known,
+        points=torch.cat([known.points, starts + depths[:, None] * lines.ahead[rays]]),
+        labels=torch.cat([known.labels, known.labels.new_zeros(len(rays))]),
+        ray_id=torch.cat([known.ray_id, ray_id[rays]]),
+    )
 
 
 def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
@@ -228,16 +283,8 @@ def _with_channels(samples: Samples, of_hits: Channels) -> Samples:
     return replace(samples, channels=pad_channels(of_hits, len(samples)))
 
 
-class _Lines(NamedTuple):
-    """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
-
-    starts: Tensor
-    ahead: Tensor
-    reach: Tensor
-
-
 def _with_unknown(
-    known: Samples, ahead: Tensor, lines: _Lines, config: SamplingConfig, rng: torch.Generator
+    known: Samples, ahead: Tensor, lines: Lines, config: SamplingConfig, rng: torch.Generator
 ) -> Samples:
     """The samples and, after them, unknown points behind the hits, where no ray went.
 
@@ -260,25 +307,56 @@ def _with_unknown(
     )
 
 
-def _stratified_depths(
-    rays: Tensor, free_end: Tensor, count: int, rng: torch.Generator
+def _free_limits(
+    rays: int, hits: int, config: SamplingConfig, max_points: int | None
+) -> tuple[int | None, int | None]:
+    """Maximum numbers of free points along all rays and close to hits, in proportion to all of them."""
+    along, near = rays * config.free_samples, hits * config.near_samples
+    if max_points is None or along + near <= max_points:
+        return None, None
+    limit = round(max_points * along / (along + near))
+    return limit, max_points - limit
+
+
+def _stretches(
+    rays: Tensor, count: int, limit: int | None, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """(Q,) which of the rays, and (Q, count) one depth [m] in each of as many equal stretches."""
-    members = _rows(rays)
-    shape = (len(members), count)
+    """Which stretches of the rays are sampled: all, or a stratified random subset.
+
+    Args:
+        rays: (R,) rows.
+        count: stretches of each ray.
+        limit: maximum number of stretches; None: all.
+        rng: random generator.
+
+    Returns:
+        (Q,) rows and (Q, C) or (1, C) numbers of stretches.
+    """
+    if limit is None or len(rays) * count <= limit:
+        return rays, torch.arange(count, device=rays.device)[None]
+    chosen = spread_rows(len(rays) * count, limit, rng)
+    return rays[chosen // max(1, count)], (chosen % max(1, count))[:, None]
+
+
+def _stratified_depths(
+    rays: Tensor, free_end: Tensor, count: int, limit: int | None, rng: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """(Q,) rows of rays, and (Q, C) depths [m], one in each of ``count`` equal stretches of a ray."""
+    members, stretches = _stretches(rays, count, limit, rng)
+    shape = (len(members), stretches.shape[1])
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
-    depths += torch.arange(count, device=rng.device)
-    return members, depths.mul_((_taken(free_end, members) / count)[:, None])
+    depths += stretches
+    return members, depths.mul_((_chosen(free_end, members) / count)[:, None])
 
 
 def _near_depths(
-    rays: Tensor, free_end: Tensor, config: SamplingConfig, rng: torch.Generator
+    rays: Tensor, free_end: Tensor, config: SamplingConfig, limit: int | None, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """(Q,) which of the rays, and (Q, near_samples) depths [m] close in front of their hits."""
-    members = _rows(rays)
-    shape = (len(members), config.near_samples)
+    """(Q,) rows of rays, and (Q, C) depths [m] close in front of their hits."""
+    members, stretches = _stretches(rays, config.near_samples, limit, rng)
+    shape = (len(members), stretches.shape[1])
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
-    end = _taken(free_end, members)[:, None]
+    end = _chosen(free_end, members)[:, None]
     # A short ray is sampled over its whole free part, so that no sample lies in the sensor.
     return members, end - depths * end.clamp(max=config.near_reach - config.near_margin)
 
@@ -304,66 +382,17 @@ def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
     return tensor if len(rows) == len(tensor) else tensor.index_select(0, rows)
 
 
-def table_entry(cells: Tensor) -> Tensor:
-    """(..., D) numbers of cells, int64 -> (...) entry of the table that each has, int64."""
-    entry = cells[..., 0] * PRIMES[0]
-    for axis in range(1, cells.shape[-1]):
-        entry = entry ^ (cells[..., axis] * PRIMES[axis % len(PRIMES)])
-    return entry & ((1 << TABLE_BITS) - 1)
+def _chosen(tensor: Tensor, rows: Tensor) -> Tensor:
+    """``tensor[rows]`` of any rows."""
+    return tensor.index_select(0, rows)
 
 
-def never_crossed(
-    points: Tensor, starts: Tensor, ahead: Tensor, reach: Tensor, edge: float
-) -> Tensor:
-    """(N, D) positions -> (N,) bool: no ray went through the cell.
-
-    Each ray is followed in steps of a cell's edge. Cells that a ray cuts by less than a corner may
-    be missed, and a place that shares its entry of the table with a crossed cell is held to be
-    crossed: that is rare, and costs a sample.
-
-    Args:
-        points: (N, D) positions [m].
-        starts: (R, D), or (1, D) where all are one, origins of the rays [m].
-        ahead: (R, D) their directions, of length 1.
-        reach: (R,) how far each was seen to go [m].
-        edge: of the cells [m].
-    """
-    if len(reach) == 0:
-        return torch.ones(len(points), dtype=torch.bool, device=points.device)
-    corner = starts.mean(dim=0)
-    cells = ((points - corner) / edge).floor().long()
-    begins = (starts - corner) / edge
-    whole = begins.floor()
-    # float32 serves along a ray: it counts from the border of the cell where the ray begins
-    rays = (whole.long(), (begins - whole).float(), ahead.float(), (reach / edge).long() + 1)
-    if native.supports(points):
-        return torch.ops.lardhm.unmarked_cells(cells, *rays)
-    return unmarked_cells(cells, *rays)
-
-
-def unmarked_cells(
-    cells: Tensor, starts: Tensor, inside: Tensor, ways: Tensor, steps: Tensor
-) -> Tensor:
-    """(N, D) numbers of cells -> (N,) bool: no ray marked the cell's entry of the table.
-
-    Args:
-        cells: (N, D) int64.
-        starts: (R, D) or (1, D) int64, cells where the rays begin.
-        inside: of the same shape, float32, where in them, in units of a cell.
-        ways: (R, D) float32 directions, of length 1.
-        steps: (R,) int64, how many cells on each ray is followed.
-    """
-    marked = torch.zeros(1 << TABLE_BITS, dtype=torch.bool, device=cells.device)
-    order = steps.argsort()
-    ends, ways = steps[order], ways[order]
-    if len(starts) > 1:
-        starts, inside = starts[order], inside[order]
-    first = torch.searchsorted(ends, torch.arange(int(ends[-1]), device=ends.device), right=True)
-    for step, begin in enumerate(first.tolist()):  # the rays that go farther
-        rows = slice(begin if len(starts) > 1 else 0, None)
-        along = inside[rows] + ways[begin:] * (step + 0.5)  # two roundings, everywhere the same
-        marked[table_entry(starts[rows] + along.floor().long())] = True
-    return ~marked[table_entry(cells)]
+def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) -> Tensor:
+    """(*times, count) ascending random rows of N: one from each of ``count`` <= N equal strata."""
+    shape = (*times, count)
+    place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
+    place += torch.arange(count, device=rng.device)
+    return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
 
 def seeded_generator(

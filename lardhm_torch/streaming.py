@@ -178,7 +178,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         rows = torch.randperm(len(scan), generator=rng, device=rng.device)[: config.max_rays]
         scan = scan.select(rows.sort().values)
     try:
-        samples = sample_rays(scan, config.sampling, seed=seed)
+        samples = sample_rays(scan, config.sampling, seed=seed, max_points=config.update.max_points)
     except NoUsableRayError as error:
         warnings.warn(f"scan {number} was skipped: no usable ray; {error}", stacklevel=3)
         return

@@ -6,7 +6,7 @@ from native_maps import dims
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.sampling import PRIMES, TABLE_BITS, never_crossed, unmarked_cells
+from lardhm_torch.native.crossings import PRIMES, TABLE_BITS, never_crossed, unmarked_cells
 
 F64 = torch.float64
 MIXED = {"short": 0.3, "long": 300.0}

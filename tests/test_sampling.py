@@ -47,6 +47,27 @@ def test_free_samples_are_stratified_over_the_ray():
     assert torch.equal(depth.floor().long(), torch.arange(10))
 
 
+def test_a_limit_draws_a_random_subset_of_the_points_of_each_label():
+    scans = random_scans(rays=2000)
+    whole, part = sample_rays(scans), sample_rays(scans, max_points=500)
+    depth, aside, ranges = depth_of(part, scans)
+    hits, free = part.labels == 1, part.labels == 0
+    assert hits.sum() == free.sum() == 500
+    assert 0 < (part.labels == 0.5).sum() <= 500
+    assert (aside < 1e-12).all()
+    assert (depth[free] <= (ranges[free] - 0.15).clamp(min=0) + 1e-12).all()
+    assert torch.equal(part.points[hits], scans.ends[part.ray_id[hits]])
+    assert len(part.ray_id[hits].unique()) == 500
+    every = depth_of(whole, scans)[0][whole.labels == 0]
+    assert abs(float(depth[free].mean() / every.mean()) - 1) < 0.05
+
+
+def test_a_limit_above_the_number_of_points_changes_nothing():
+    scans = random_scans()
+    whole, same = sample_rays(scans), sample_rays(scans, max_points=10_000)
+    assert torch.equal(whole.points, same.points)
+
+
 def test_near_samples_lie_close_in_front_of_the_hit():
     scans = random_scans()
     near = sample_rays(scans, SamplingConfig(near_samples=3, behind_samples=0))

@@ -7,7 +7,8 @@ from lardhm_torch import LardHilbertMap, Scans, sample_rays
 from lardhm_torch.features import neighbor_fade
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.unseen import draw_tails, off_surfaces
-from lardhm_torch.sampling import UNKNOWN, SamplingConfig, never_crossed
+from lardhm_torch.native.crossings import never_crossed
+from lardhm_torch.sampling import UNKNOWN, SamplingConfig
 
 F64 = torch.float64
 

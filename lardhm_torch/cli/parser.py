@@ -208,13 +208,9 @@ def _file_verbs(verb: Any) -> None:
     )
     _resolution(sub, 0.1)
     sub.add_argument(
-        "--distance",
-        action="store_true",
-        help="write signed distances to the nearest surface [m]; only .npz",
+        "--distance", action="store_true", help="signed distances to the nearest surface [m]; .npz"
     )
-    sub.add_argument(
-        "--sparse", action="store_true", help="with .npz: only blocks of cells near clusters"
-    )
+    sub.add_argument("--sparse", action="store_true", help="with .npz: only blocks near clusters")
     sub.add_argument("--channel", metavar="NAME", help="with .npz: a channel to write, too")
     sub.add_argument(
         "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"

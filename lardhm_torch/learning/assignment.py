@@ -56,6 +56,26 @@ def nearest_clusters(points: Tensor, clusters: Clusters, floor: float, radius: f
     return torch.where(whitened.square().sum(dim=(1, 2)) <= radius**2, owners, -1)
 
 
+def feature_sums(
+    points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
+) -> Tensor:
+    """(M,) sum of the features of each cluster over points.
+
+    Args:
+        points: (N, D) positions [m].
+        centers: (M, D) cluster centers [m].
+        raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
+        kernel: k, covariance scale and minimum length-scale.
+        index: search index of the centers, see `native.build_index`.
+    """
+    if native.supports(points):
+        given = (points, centers, raw_scale_tril, index)
+        return torch.ops.lardhm.feature_sums(*(t.detach() for t in given), *kernel)
+    found, values = native.nearest_features(points, centers, raw_scale_tril, kernel, index)
+    sums = torch.zeros_like(centers[:, 0])
+    return sums.index_add_(0, found.reshape(-1).long(), values.reshape(-1))
+
+
 def ordered_features(
     points: Tensor,
     order: Tensor,

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.learning.points import morton_order
+from lardhm_torch.learning.points import count_cells, morton_order
 from lardhm_torch.native import nearest_centers
+from lardhm_torch.sampling import spread_rows
 
 POINTS_PER_CLUSTER = 15  # minimum mean number of points per cluster in `choose_num_clusters`
 DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the noise
@@ -239,10 +240,7 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False, represented: int 
         represented: number of points that these are a sample of, if they are one.
     """
     size = max(len(points), represented)
-    cells = (points / CELL_EDGE).floor().long()
-    strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
-    # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
-    count = len((cells * strides).sum(dim=1).unique_consecutive().unique())
+    count = count_cells(points, CELL_EDGE)
     few = min(count, max_singletons(size))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
     finest = max(size // POINTS_PER_CLUSTER, few)
@@ -329,14 +327,6 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     position = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
     place = (torch.arange(num_clusters, device=rng.device) + position) / num_clusters * along[-1]
     return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
-
-
-def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) -> Tensor:
-    """(*times, count) ascending random rows of N: one from each of ``count`` <= N equal strata."""
-    shape = (*times, count)
-    place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
-    place += torch.arange(count, device=rng.device)
-    return (place * (num_points / count)).long().clamp_(max=num_points - 1)
 
 
 def clusters_from_moments(

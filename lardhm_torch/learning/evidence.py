@@ -8,17 +8,21 @@ repeated points change nothing.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
+from lardhm_torch.features import raw_factors
+from lardhm_torch.learning.cluster_matching import moved_factors
 from lardhm_torch.learning.clustering import (
     Clusters,
     clusters_from_moments,
     split_labels,
-    spread_rows,
 )
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
+from lardhm_torch.sampling import spread_rows
 
 SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
 MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
@@ -69,13 +73,46 @@ def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
 
 def kept_counts(evidence: Tensor) -> Tensor:
     """(M, E, D) evidence -> (M,) number of kept points."""
+    if _is_native(evidence):
+        return torch.ops.lardhm.kept_counts(evidence)
     return (~evidence[:, :, 0].isinf()).sum(dim=1)
 
 
-def kept_points(evidence: Tensor) -> tuple[Tensor, Tensor]:
-    """(M, E, D) evidence -> (L, D) kept points and (L,) their clusters, ascending."""
-    mask = ~evidence[:, :, 0].isinf()
-    return evidence[mask], mask.nonzero()[:, 0]
+def kept_points(evidence: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The points that some clusters keep.
+
+    Args:
+        evidence: (M, E, D).
+        rows: (Q,) clusters; None: all.
+
+    Returns:
+        (L, D) points, in the order of ``rows``, and (L,) the cluster of each.
+    """
+    if rows is None:
+        rows = torch.arange(len(evidence), device=evidence.device)
+    if _is_native(evidence):
+        return torch.ops.lardhm.kept_points(evidence, rows)
+    found = evidence[rows]
+    mask = ~found[:, :, 0].isinf()
+    return found[mask], rows[mask.nonzero()[:, 0]]
+
+
+def kept_again(points: Tensor, owners: Tensor, evidence: Tensor) -> Tensor:
+    """(M,) number of the points of each cluster that it keeps already.
+
+    Args:
+        points: (N, D) positions [m].
+        owners: (N,) their clusters.
+        evidence: (M, E, D).
+    """
+    if _is_native(evidence):
+        return torch.ops.lardhm.kept_again(points, owners, evidence)
+    again = (evidence[owners] == points[:, None]).all(dim=2).any(dim=1)
+    return torch.bincount(owners[again], minlength=len(evidence))
+
+
+def _is_native(evidence: Tensor) -> bool:
+    return evidence.shape[1] > 0 and native.supports(evidence[:, 0])
 
 
 def first_points(evidence: Tensor, counts: Tensor) -> Tensor:
@@ -86,11 +123,62 @@ def first_points(evidence: Tensor, counts: Tensor) -> Tensor:
 
 def evidence_moments(evidence: Tensor) -> Clusters:
     """Moments of the kept points of M clusters; the mean is not finite if a cluster has none."""
+    if _is_native(evidence):
+        return Clusters(*torch.ops.lardhm.kept_moments(evidence))
     mask = ~evidence[:, :, :1].isinf()
     offsets = torch.where(mask, evidence - evidence[:, :1], 0)
     counts = mask.sum(dim=(1, 2))
     sums, scatters = offsets.sum(dim=1), offsets.mT @ offsets
     return clusters_from_moments(evidence[:, 0], counts, sums, scatters)
+
+
+def following(
+    state: MapState, rows: Tensor, evidence: Tensor, num_known: int, floor: float
+) -> MapState:
+    """Clusters that follow the points they keep. Fine-tuning of known ones is preserved.
+
+    Args:
+        state: M clusters.
+        rows: (Q,) clusters whose points changed; each keeps one or more.
+        evidence: (Q, E, D) their points [m].
+        num_known: number of clusters that are not new, the first ones.
+        floor: smallest standard deviation [m].
+    """
+    names = ("counts", "centers", "means", "scatters", "raw_scale_tril")
+    before = [getattr(state, name).index_select(0, rows) for name in names]
+    given = (evidence, *before, rows < num_known, floor)
+    found = torch.ops.lardhm.follow_kept(*given) if _is_native(evidence) else follow_kept(*given)
+    after = zip(names[1:], found, strict=True)
+    return replace(
+        state, **{name: getattr(state, name).index_copy(0, rows, t) for name, t in after}
+    )
+
+
+def follow_kept(
+    evidence: Tensor, counts: Tensor, centers: Tensor, means: Tensor, scatters: Tensor,
+    raw_scale_tril: Tensor, known: Tensor, floor: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Centers, means, scatters and raw factors of clusters that got the moments of their points.
+
+    Args:
+        evidence: (M, E, D) points [m], one or more in each cluster.
+        counts: (M,) number of points that they represent.
+        centers: (M, D) [m].
+        means: (M, D) [m].
+        scatters: (M, D, D) [m^2].
+        raw_scale_tril: (M, D, D).
+        known: (M,) bool: the center and the factor move as the moments do; otherwise they are those
+            of the moments.
+        floor: smallest standard deviation [m].
+    """
+    found = evidence_moments(evidence)
+    scale = (counts - 1).clamp(min=1).to(scatters)[:, None, None]
+    old = factor_covariances(scatters / scale, floor)
+    new = factor_covariances(found.covariances, floor)
+    raw = torch.where(
+        known[:, None, None], moved_factors(raw_scale_tril, old, new), raw_factors(new)
+    )
+    return centers + (found.means - means), found.means, found.covariances * scale, raw
 
 
 def halves(evidence: Tensor) -> tuple[Tensor, Tensor]:

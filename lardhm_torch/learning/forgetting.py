@@ -13,8 +13,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from lardhm_torch import native
 from lardhm_torch.features import Kernel
+from lardhm_torch.learning.assignment import feature_sums
 from lardhm_torch.learning.evidence import first_points, kept_counts
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.sampling import UNKNOWN
@@ -45,15 +45,9 @@ def doubted(
     if len(known) == 0 or len(points) == 0:
         return known.doubts
     kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, NARROWEST))
-    indices, values = native.nearest_features(
-        points, known.centers, known.raw_scale_tril, kernel, index
-    )
-
-    def total(rows: Tensor) -> Tensor:
-        sums = torch.zeros_like(known.weights)
-        return sums.index_add_(0, indices[rows].reshape(-1).long(), values[rows].reshape(-1))
-
-    doubts = torch.where(total(is_hit) > HIT, 0, known.doubts + total(~is_hit))
+    parameters = (known.centers, known.raw_scale_tril, kernel, index)
+    hits, passed = (feature_sums(points[rows], *parameters) for rows in (is_hit, ~is_hit))
+    doubts = torch.where(hits > HIT, 0, known.doubts + passed)
     return doubts * known.is_occupied
 
 

@@ -188,6 +188,21 @@ def morton_order(points: Tensor) -> Tensor:
     return code.argsort(stable=True)
 
 
+def count_cells(points: Tensor, edge: float) -> int:
+    """Number of cells of a lattice that hold one or more of (N, D) points.
+
+    Args:
+        points: (N, D) positions [m].
+        edge: of the cells [m].
+    """
+    if native.supports(points):
+        return torch.ops.lardhm.count_cells(points.detach(), edge)
+    cells = (points / edge).floor().long()
+    strides = (1 << 21) ** torch.arange(cells.shape[1], device=cells.device)
+    # consecutive points mostly lie in one cell: this leaves a fraction of them to sort
+    return len((cells * strides).sum(dim=1).unique_consecutive().unique())
+
+
 def as_tensor(values: TensorLike, name: str, device: torch.device) -> Tensor:
     """Convert to a tensor on a device. Tensors and arrays keep their dtype; lists become float64.
 

@@ -1,8 +1,9 @@
-"""Regrouping: new points and the evidence of one class of clusters, grouped anew where they changed.
+"""Regrouping: new points and the evidence of the clusters near them, grouped anew where they changed.
 
-One step of adaptive k-means on the kept points. Clusters whose points the map predicts badly are
-divided, new points join the nearest cluster or form new ones, every point of a changed cluster goes to
-its nearest center, and clusters with too few points are dissolved into their neighbors.
+One step of adaptive k-means on the kept points, for each class by itself. Clusters whose points the
+map predicts badly are divided, new points join the nearest cluster or form new ones, every point of a
+changed cluster goes to its nearest center, and clusters with too few points are dissolved into their
+neighbors.
 """
 
 from __future__ import annotations
@@ -14,9 +15,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.assignment import nearest_clusters
-from lardhm_torch.learning.cluster_matching import moved_factors
 from lardhm_torch.learning.clustering import (
     MIN_COUNT,
     Clusters,
@@ -26,116 +25,131 @@ from lardhm_torch.learning.clustering import (
 )
 from lardhm_torch.learning.evidence import (
     evidence_moments,
+    following,
     halves,
     keep_points,
+    kept_again,
     kept_counts,
     kept_points,
 )
 from lardhm_torch.learning.forgetting import trust
-from lardhm_torch.learning.map_state import MapState, factor_covariances, new_rows
+from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
 NEW_ITERATIONS = 5  # of k-means for new clusters
+PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 
 
 class Rule(NamedTuple):
-    """How clusters of a class are regrouped.
+    """How clusters are regrouped.
 
     Args:
-        kind: 0 occupied, 1 free, 2 unknown.
-        limit: maximum number of clusters; more are dissolved, smallest first.
-        grows: clusters of new points in places without clusters raise the limit.
+        occupied: number of occupied clusters up to which they are divided.
+        grows: clusters of new points in places without clusters raise the limits.
         few: there are so few hits that each may have a cluster of its own.
         split_loss: clusters with a larger mean loss are divided while there are fewer.
         floor: smallest standard deviation [m].
     """
 
-    kind: int
-    limit: int
+    occupied: int
     grows: bool
     few: bool
     split_loss: float
     floor: float
 
 
-def regrouped(known: MapState, points: Tensor, rule: Rule, rng: torch.Generator) -> MapState:
-    """Clusters of one class after new points of this class were added.
+class Groups(NamedTuple):
+    """Clusters that are regrouped: their class is fixed, and their points are apart from the rest.
 
     Args:
-        known: K clusters of the class.
-        points: (N, D) new points of the class [m].
-        rule: class and limits.
+        state: M clusters without evidence.
+        evidence: (M, E, D) their points.
+        kinds: (M,) class, see `MapState.kinds`.
+        changed: (M,) bool: the points go to the nearest centers.
+    """
+
+    state: MapState
+    evidence: Tensor
+    kinds: Tensor
+    changed: Tensor
+
+    def rows(self, kind: int) -> Tensor:
+        """Rows of the clusters of a class."""
+        return (self.kinds == kind).nonzero().squeeze(1)
+
+
+def regrouped(
+    known: MapState, classes: tuple[Tensor, ...], rule: Rule, rng: torch.Generator
+) -> MapState:
+    """Clusters after new points were added.
+
+    Args:
+        known: K clusters.
+        classes: new occupied, free and unknown points, (N, D) each [m].
+        rule: limits.
         rng: random generator.
 
     Returns:
         The K clusters followed by new ones; clusters without points have been dissolved.
     """
-    state, divided = _divide(known, rule)
-    owners = nearest_clusters(points, state.clusters, rule.floor, JOIN_STDS)
-    rest = points[owners < 0]
-    start = len(state)
-    if len(rest) >= MIN_COUNT or (len(rest) and (rule.few or len(known) == 0)):
-        state = state.put(owners[:0], _new_clusters(rest, rule, rng))
-        owners = owners.masked_scatter(owners < 0, start + _nearest(rest, state.means[start:]))
-    joined = torch.bincount(owners[owners >= 0], minlength=len(state))
-    limit = rule.limit + (len(state) - start if rule.grows else 0)
-    alive = _kept(state, joined, limit, rule.few)
-    is_new = torch.arange(len(state), device=alive.device) >= start
-    divided = torch.cat([divided, divided.new_zeros(len(state) - start)])
-    touched = divided | (joined > 0) | is_new | ~alive
-    evidence = _reassigned(state, points[owners >= 0], touched, alive)
-    fresh = state.fresh + (evidence != state.evidence).any(dim=2).sum(dim=1)
-    if rule.kind < 2:
-        state = replace(state, counts=state.counts + _unseen(state, points, owners, joined))
-    return _moved(replace(state, evidence=evidence, fresh=fresh), rule, len(known))
+    groups = _divide(known, rule)
+    before = len(groups.kinds)
+    groups, owners = _joined(groups, classes, rule, rng)
+    points, joined = torch.cat(classes), torch.cat(owners)
+    points, joined = points[joined >= 0], joined[joined >= 0]
+    received = torch.bincount(joined, minlength=len(groups.kinds))
+    alive = _kept(groups, received, before, rule)
+    groups = groups._replace(changed=groups.changed | (received > 0) | ~alive)
+    counts = groups.state.counts + _unseen(groups, points, joined, received)
+    state = replace(groups.state, counts=torch.where(groups.kinds < 2, counts, 0))
+    state = replace(state, scatters=_rescaled(groups.state, state.counts))
+    return _reassigned(groups._replace(state=state), points, joined, alive, len(known), rule.floor)
 
 
-def _divide(known: MapState, rule: Rule) -> tuple[MapState, Tensor]:
+def _divide(known: MapState, rule: Rule) -> Groups:
     """Divide clusters of large loss in two; the second halves are appended."""
+    kinds, light = known.kinds, replace(known, evidence=known.evidence[:, :0])
     divided = torch.zeros_like(known.is_occupied)
-    room = rule.limit - len(known)
     losses = known.losses * trust(known.doubts)
     large = (losses > rule.split_loss) & (kept_counts(known.evidence) >= SPLIT)
-    rows = large.nonzero().squeeze(1)
-    if room <= 0 or len(rows) == 0:
-        return known, divided
-    rows = rows[losses[rows].argsort(descending=True, stable=True)[:room]]
-    first, second = halves(known.evidence[rows])
+    rows, occupied = [], rule.occupied
+    for kind, factor in enumerate(PER_OCCUPIED):
+        own = (kinds == kind).nonzero().squeeze(1)
+        room = max(factor * occupied, len(own)) - len(own)
+        found = own[large[own]]
+        found = found[losses[found].argsort(descending=True, stable=True)[:room]]
+        if kind == 0 and rule.grows and len(own):
+            occupied = len(own) + len(found)
+        rows.append(found)
+    chosen = torch.cat(rows)
+    if len(chosen) == 0:
+        return Groups(light, known.evidence.clone(), kinds, divided)
+    first, second = halves(known.evidence[chosen])
     sizes = torch.stack([kept_counts(first), kept_counts(second)])
-    balanced = sizes.amin(dim=0) >= MIN_COUNT
-    rows, first, second, sizes = (
-        rows[balanced],
-        first[balanced],
-        second[balanced],
-        sizes[:, balanced],
-    )
-    parents, share = known.rows(rows), sizes[0] / sizes.sum(dim=0)
-    counts = (parents.counts * share).round().to(parents.counts)
+    balanced = (sizes.amin(dim=0) >= MIN_COUNT).nonzero().squeeze(1)
+    chosen, first, second = chosen[balanced], first[balanced], second[balanced]
+    parents, shares = light.rows(chosen), (sizes / sizes.sum(dim=0))[:, balanced]
+    of_parents = kinds[chosen]
     parts = [
-        _half(parents, evidence, count, part, rule)
-        for evidence, count, part in (
-            (first, counts, share),
-            (second, parents.counts - counts, 1 - share),
-        )
+        _half(parents, of_parents, evidence, share, rule)
+        for evidence, share in zip((first, second), shares, strict=True)
     ]
     both = MapState(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
-    divided = torch.cat([divided.index_fill(0, rows, True), divided.new_ones(len(rows))])
-    return known.put(rows, both), divided
+    evidence = torch.cat([known.evidence, second]).index_copy_(0, chosen, first)
+    divided = torch.cat([divided.index_fill(0, chosen, True), divided.new_ones(len(chosen))])
+    return Groups(light.put(chosen, both), evidence, torch.cat([kinds, of_parents]), divided)
 
 
 def _half(
-    parents: MapState, evidence: Tensor, counts: Tensor, fraction: Tensor, rule: Rule
+    parents: MapState, kinds: Tensor, evidence: Tensor, fraction: Tensor, rule: Rule
 ) -> MapState:
-    """Clusters with the moments of their evidence, which represents ``counts`` points.
-
-    They have a fraction of the parents' channels.
-    """
+    """Clusters with the moments of their evidence, a fraction of that of their parents."""
+    counts = (parents.counts * fraction).round().to(parents.counts).clamp(min=1)
     found = evidence_moments(evidence)
-    clusters = _represented(found, torch.zeros_like(counts) if rule.kind == 2 else counts)
-    is_occupied = torch.full_like(counts, rule.kind == 0, dtype=torch.bool)
-    rows = new_rows(clusters, is_occupied, rule.floor, evidence)
+    clusters = _represented(found, torch.where(kinds == 2, 0, counts))
+    rows = new_rows(clusters, kinds == 0, rule.floor, parents.evidence)
     return replace(
         rows,
         weights=parents.weights,
@@ -152,79 +166,125 @@ def _represented(found: Clusters, counts: Tensor) -> Clusters:
     return Clusters(counts, found.means, found.covariances * factor[:, None, None])
 
 
-def _new_clusters(points: Tensor, rule: Rule, rng: torch.Generator) -> MapState:
+def _rescaled(state: MapState, counts: Tensor) -> Tensor:
+    """Scatters of clusters whose counts became ``counts`` and whose covariances are the same."""
+    factor = (counts - 1).clamp(min=1) / (state.counts - 1).clamp(min=1)
+    return state.scatters * factor[:, None, None].to(state.scatters)
+
+
+def _joined(
+    groups: Groups, classes: tuple[Tensor, ...], rule: Rule, rng: torch.Generator
+) -> tuple[Groups, list[Tensor]]:
+    """Clusters followed by new ones of points far from all others, and the cluster of each point.
+
+    The cluster is -1 if a point forms none because there are too few like it.
+    """
+    owners, added, kinds = [], [], []
+    start = len(groups.kinds)
+    for kind, points in enumerate(classes):
+        rows = groups.rows(kind)
+        near = Clusters(*(moments[rows] for moments in groups.state.clusters))
+        own = nearest_clusters(points, near, rule.floor, JOIN_STDS)
+        far = (own < 0).nonzero().squeeze(1)
+        joined = rows[own.clamp(min=0)] if len(rows) else own
+        if len(far) >= MIN_COUNT or (len(far) and (rule.few or len(rows) == 0)):
+            rest = points[far]
+            new = _new_clusters(rest, kind, rule, rng)
+            added.append(replace(new, evidence=new.evidence[:, :0]))
+            kinds.append(torch.full_like(new.counts, kind))
+            joined = joined.index_copy(0, far, start + _nearest(rest, new.means))
+            start += len(new)
+        else:
+            joined = joined.index_fill(0, far, -1)
+        owners.append(joined)
+    if not added:
+        return groups, owners
+    state = groups.state
+    for new in added:
+        state = state.put(joined[:0], new)
+    count = start - len(groups.kinds)
+    empty = groups.evidence.new_full((count, *groups.evidence.shape[1:]), torch.inf)
+    return Groups(
+        state,
+        torch.cat([groups.evidence, empty]),
+        torch.cat([groups.kinds, *kinds]),
+        torch.cat([groups.changed, groups.changed.new_ones(count)]),
+    ), owners
+
+
+def _new_clusters(points: Tensor, kind: int, rule: Rule, rng: torch.Generator) -> MapState:
     """Clusters of points far from all known ones. They keep no points yet."""
     (points,) = in_morton_order(points)
-    chosen = choose_num_clusters(points) * (2 if rule.kind == 1 else 1)
+    chosen = choose_num_clusters(points) * PER_OCCUPIED[kind]
     found = cluster_points(points, min(chosen, most_clusters(len(points))), rng, NEW_ITERATIONS)
     clusters = _represented(found, torch.zeros_like(found.counts))
-    return new_rows(
-        clusters, torch.full_like(found.counts, rule.kind == 0, dtype=torch.bool), rule.floor
-    )
-
-
-def _unseen(state: MapState, points: Tensor, owners: Tensor, joined: Tensor) -> Tensor:
-    """(M,) estimated number of the points joined to each cluster that it has not received before.
-
-    A cluster that keeps one in r of its points recognizes one in r of those that it receives again.
-    """
-    kept = kept_counts(state.evidence)
-    rows = ((owners >= 0) & (kept[owners] > 0)).nonzero().squeeze(1)
-    near = state.evidence[owners[rows]]
-    again = (near == points[rows][:, None]).all(dim=2).any(dim=1)
-    found = torch.bincount(owners[rows[again]], minlength=len(state))
-    represented = (state.counts / kept.clamp(min=1)).clamp(min=1)
-    return joined - torch.minimum(joined, (found * represented).round().to(joined))
+    is_occupied = torch.full_like(found.counts, kind == 0, dtype=torch.bool)
+    return new_rows(clusters, is_occupied, rule.floor)
 
 
 def _nearest(points: Tensor, centers: Tensor) -> Tensor:
     return native.nearest_centers(points, centers, 1).squeeze(1)
 
 
-def _kept(state: MapState, joined: Tensor, limit: int, few: bool) -> Tensor:
-    """(M,) mask of the clusters that are not dissolved."""
-    sizes = kept_counts(state.evidence) + joined
-    alive = sizes >= (1 if few else MIN_COUNT)
-    if not bool(alive.any()):
-        alive = sizes > 0
-    excess = int(alive.sum()) - max(1, limit)
-    if excess > 0:
-        alive[torch.where(alive, sizes, sizes.amax() + 1).argsort(stable=True)[:excess]] = False
+def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
+    """(M,) mask of the clusters that are not dissolved.
+
+    Args:
+        groups: M clusters.
+        received: (M,) number of new points.
+        before: number of clusters before new ones were added.
+        rule: limits.
+    """
+    sizes = kept_counts(groups.evidence) + received
+    alive = sizes >= (1 if rule.few else MIN_COUNT)
+    for kind, factor in enumerate(PER_OCCUPIED):
+        own = groups.rows(kind)
+        some = alive[own]
+        if not bool(some.any()):
+            some = sizes[own] > 0
+        limit = max(1, factor * rule.occupied, int((own < before).sum()))
+        excess = int(some.sum()) - limit
+        if excess > 0 and not rule.grows:
+            order = torch.where(some, sizes[own], sizes.amax() + 1).argsort(stable=True)
+            some[order[:excess]] = False
+        alive[own] = some
     return alive
 
 
-def _reassigned(state: MapState, points: Tensor, touched: Tensor, alive: Tensor) -> Tensor:
-    """Evidence after new points and all kept points of touched clusters went to the nearest center."""
-    rows = alive.nonzero().squeeze(1)
-    if len(rows) == 0:
-        return torch.full_like(state.evidence, torch.inf)
-    moving, _ = kept_points(state.evidence[touched])
-    moving = torch.cat([points, moving])
-    owners = _nearest(moving, state.means[rows])
-    receives = torch.zeros_like(alive).index_fill(0, rows[owners], True)
-    staying, places = kept_points(state.evidence[receives & ~touched])
+def _unseen(groups: Groups, points: Tensor, owners: Tensor, joined: Tensor) -> Tensor:
+    """(M,) estimated number of the points joined to each cluster that it has not received before.
+
+    A cluster that keeps one in r of its points recognizes one in r of those that it receives again.
+    """
+    found = kept_again(points, owners, groups.evidence)
+    kept = kept_counts(groups.evidence).clamp(min=1)
+    represented = (groups.state.counts / kept).clamp(min=1)
+    return joined - torch.minimum(joined, (found * represented).round().to(joined))
+
+
+def _reassigned(
+    groups: Groups, points: Tensor, owners: Tensor, alive: Tensor, num_known: int, floor: float
+) -> MapState:
+    """Clusters after all points of changed ones and new points went to the nearest center."""
+    state, evidence, changed = groups.state, groups.evidence, groups.changed
+    moving, homes = kept_points(evidence, changed.nonzero().squeeze(1))
+    moving, homes = torch.cat([points, moving]), torch.cat([owners, homes])
+    target = torch.full_like(homes, -1)
+    for kind in range(3):
+        rows = (alive & (groups.kinds == kind)).nonzero().squeeze(1)
+        own = (groups.kinds[homes] == kind).nonzero().squeeze(1)
+        if len(rows) and len(own):
+            target[own] = rows[_nearest(moving[own], state.means[rows])]
+    receives = torch.zeros_like(alive).index_fill_(0, target[target >= 0], True)
+    staying, places = kept_points(evidence, (receives & ~changed).nonzero().squeeze(1))
     order = torch.cumsum(receives, 0) - 1  # of the clusters that receive points
-    places = order[(receives & ~touched).nonzero().squeeze(1)[places]]
-    kept = keep_points(
-        torch.cat([moving, staying]), torch.cat([order[rows[owners]], places]), int(receives.sum())
-    )
-    evidence = state.evidence.masked_fill((touched & ~receives)[:, None, None], torch.inf)
-    return evidence.index_copy(0, receives.nonzero().squeeze(1), kept)
-
-
-def _moved(state: MapState, rule: Rule, num_known: int) -> MapState:
-    """Clusters whose evidence changed get its moments; fine-tuning of known clusters is preserved."""
-    rows = ((state.fresh > 0) & (kept_counts(state.evidence) > 0)).nonzero().squeeze(1)
-    before = state.rows(rows)
-    found = evidence_moments(before.evidence)
-    clusters = _represented(found, before.counts)
-    old, new = (factor_covariances(c.covariances, rule.floor) for c in (before.clusters, clusters))
-    raw = torch.where(
-        (rows < num_known)[:, None, None],
-        moved_factors(before.raw_scale_tril, old, new),
-        raw_factors(new),
-    )
-    centers = before.centers + (clusters.means - before.means)
-    after = replace(before, centers=centers, raw_scale_tril=raw, counts=clusters.counts,
-                    means=clusters.means, scatters=clusters.scatters)  # fmt: skip
-    return state.put(rows, after)
+    homes = torch.cat([torch.where(target >= 0, order[target], -1), order[places]])
+    kept = keep_points(torch.cat([moving, staying]), homes, int(receives.sum()))
+    rows = receives.nonzero().squeeze(1)
+    new = (kept != evidence[rows]).any(dim=2).sum(dim=1)
+    evidence = evidence.index_fill_(0, (changed & ~receives).nonzero().squeeze(1), torch.inf)
+    evidence = evidence.index_copy_(0, rows, kept)
+    fresh = state.fresh.index_add(0, rows, new.to(state.fresh))
+    state = replace(state, evidence=evidence, fresh=fresh)
+    moved = (new > 0).nonzero().squeeze(1)
+    return following(state, rows[moved], kept[moved], num_known, floor)

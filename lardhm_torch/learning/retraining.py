@@ -54,8 +54,8 @@ def retrained(
     moving = changed | _neighbors(changed, state.centers, kernel.num_neighbors, index)
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
-    points, owners = kept_points(state.evidence[rows])
-    owners = rows[owners]
+    rows = rows[morton_order(state.centers[rows])]
+    points, owners = kept_points(state.evidence, rows)
     kinds, strength = state.kinds[owners], evidence_weights(state)[owners]
     factors = balanced(kinds, strength, config) * trust(state.doubts)[owners]
     labels = KIND_LABELS.to(points)[kinds]
@@ -82,7 +82,8 @@ def trained(
     Args:
         state: M clusters.
         index: search index of the centers, see `native.build_index`.
-        samples: (N, D) positions [m]; (N,) labels in [0, 1]; (N,) loss factors, mean 1.
+        samples: (N, D) positions [m], neighbors close to each other in memory; (N,) labels in [0, 1];
+            (N,) loss factors, mean 1.
         task: kernel, training settings and random generator.
 
     Returns:
@@ -92,13 +93,10 @@ def trained(
     points, labels, factors = samples
     config = task.config
     batch_size = config.rows_per_batch(len(points))
-    along = morton_order(points)
+    along = torch.arange(len(points), device=points.device)
     (batched,) = stratified_batches((along,), batch_size, task.rng)
-    points = points.index_select(0, along)
-    place = torch.empty_like(along)
-    place[along] = torch.arange(len(along), device=along.device)
     features = ordered_features(
-        points, place[batched], state.centers, state.raw_scale_tril, task.kernel, index
+        points, batched, state.centers, state.raw_scale_tril, task.kernel, index
     )
     targets = labels[batched]
     weights = fit_weights(

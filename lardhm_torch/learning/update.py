@@ -24,7 +24,6 @@ from lardhm_torch.learning.clustering import (
     choose_num_clusters,
     cluster_classes,
     split_labels,
-    spread_rows,
 )
 from lardhm_torch.learning.evidence import kept_counts, kept_points, with_evidence
 from lardhm_torch.learning.fitting import FitConfig, FitTask
@@ -33,7 +32,7 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
-from lardhm_torch.sampling import UNKNOWN
+from lardhm_torch.sampling import UNKNOWN, spread_rows
 
 MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
 UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown
@@ -109,7 +108,10 @@ def updated(
     points, labels = _still_unknown(part, points, labels, kernel, index)
     before = part.doubts
     part = replace(part, doubts=doubted(part, points, labels, kernel, index))
-    part = _regrouped(forget(part, before), points, labels, num_clusters, few, task)
+    part, classes = forget(part, before), tuple(split_labels(points, labels))
+    occupied, grows = _most_occupied(part, classes[0], num_clusters), num_clusters is None
+    rule = Rule(occupied, grows, few, config.split_loss, kernel.min_lengthscale)
+    part = regrouped(part, classes, rule, rng)
     alive = kept_counts(part.evidence) > 0
     part = handed_over(part, alive)
     part = retrained(part.rows(alive), config.max_trained, kernel, config.fit, rng)
@@ -161,26 +163,6 @@ def _still_unknown(
     return points[kept], labels[kept]
 
 
-def _regrouped(
-    part: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, few: bool, task: Task
-) -> MapState:
-    """All classes regrouped with their new points."""
-    kinds, floor = part.kinds, task.kernel.min_lengthscale
-    classes = split_labels(points, labels)
-    limit = _most_occupied(part, classes[0], num_clusters)
-    grows = num_clusters is None
-    for kind, members in enumerate(classes):
-        own = (kinds == kind).nonzero().squeeze(1)
-        rule = Rule(kind, max(limit, len(own)), grows, few, task.config.split_loss, floor)
-        if len(own) or len(members):
-            part = part.put(own, regrouped(part.rows(own), members, rule, task.rng))
-        if kind == 0:  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
-            kept = part.is_occupied & (kept_counts(part.evidence) > 0)
-            occupied = int(kept.sum()) if num_clusters is None and bool(kept.any()) else limit
-        limit = (2 - kind) * occupied if kind < 2 else 0
-    return part
-
-
 def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None) -> int:
     """Number of occupied clusters up to which those near a scan are divided.
 
@@ -188,7 +170,7 @@ def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None) -> in
     """
     if num_clusters is not None:
         return num_clusters // 4
-    kept, _ = kept_points(part.evidence[part.is_occupied])
+    kept, _ = kept_points(part.evidence, part.is_occupied.nonzero().squeeze(1))
     if len(kept) == 0:
         return choose_num_clusters(hits)
     represented = int(part.counts[part.is_occupied].sum())

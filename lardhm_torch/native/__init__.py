@@ -324,6 +324,10 @@ def _register() -> None:
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.bool)
 
+    @library.register_fake("lardhm::balanced_order")
+    def _(points: Tensor, levels: int) -> Tensor:
+        return points.new_empty(points.shape[0], dtype=torch.long)
+
     @library.register_fake("lardhm::keep_points")
     def _(points: Tensor, owners: Tensor, num_clusters: int, size: int) -> Tensor:
         return points.new_empty(num_clusters, size, points.shape[1])

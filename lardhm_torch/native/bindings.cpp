@@ -71,6 +71,10 @@ Tensor new_zeros(const Tensor& like, const Sizes& sizes) {
   return Held::hold(stable::new_zeros(Held::of(like), as_list(sizes)));
 }
 
+Tensor new_zeros(const Tensor& like, const Sizes& sizes, ScalarType type) {
+  return Held::hold(stable::new_zeros(Held::of(like), as_list(sizes), TorchType(type)));
+}
+
 Tensor contiguous(const Tensor& tensor) {
   if (tensor.is_contiguous()) return tensor;
   return Held::hold(stable::contiguous(Held::of(tensor)));
@@ -111,10 +115,12 @@ Slot box(const Tensor& tensor) { return stable::detail::from(Held::of(tensor)); 
 
 Slot box(bool value) { return stable::detail::from(value); }
 
+Slot box(int64_t value) { return stable::detail::from(value); }
+
 #define LARDHM_SOURCES(USE)                                                                 \
   USE(cells) USE(descent) USE(evidence) USE(expected_range) USE(faces) USE(gradients)       \
-  USE(kmeans) USE(marching) USE(mixture) USE(pooling) USE(query) USE(raycast) USE(ridge)    \
-  USE(tuning) USE(update)
+  USE(kept) USE(kmeans) USE(marching) USE(mixture) USE(passages) USE(pooling) USE(query)    \
+  USE(raycast) USE(ridge) USE(tuning) USE(update)
 
 // Each source that has operators lists them.
 #define LARDHM_DECLARE(source) std::vector<Operator> source##_operators();

@@ -1,5 +1,5 @@
 // Cells of space that rays pass through: a hash table with one bit per cell, as in
-// `sampling.unmarked_cells`.
+// `crossings.unmarked_cells`.
 
 #include <algorithm>
 #include <atomic>
@@ -14,9 +14,9 @@
 namespace lardhm {
 namespace {
 
-constexpr int kTableBits = 24;                                  // as sampling.TABLE_BITS
+constexpr int kTableBits = 24;                                  // as crossings.TABLE_BITS
 constexpr int kGlanceBits = 22;                                 // 512 KB
-constexpr uint32_t kPrimes[3] = {73856093, 19349669, 83492791};  // as sampling.PRIMES
+constexpr uint32_t kPrimes[3] = {73856093, 19349669, 83492791};  // as crossings.PRIMES
 constexpr int64_t kRaysPerTask = 256, kPointsPerTask = 8192;
 
 // A power of two of bits; larger indices wrap around.

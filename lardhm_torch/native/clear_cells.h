@@ -23,9 +23,9 @@
 
 namespace lardhm {
 
-constexpr double kRounding = 1e-5;   // fraction and log-odds added to a bound for float32
-constexpr double kNegligible = 60;   // squared whitened distance beyond which a cluster adds 1e-13
-constexpr double kCellMargin = 1e-3; // of a cell, by which it is taken as larger
+constexpr double kRounding = 1e-5;    // fraction and log-odds added to a bound for float32
+constexpr double kNegligible = 60;    // squared whitened distance beyond which a cluster adds 1e-13
+constexpr double kCellMargin = 1e-3;  // of a cell, by which it is taken as larger
 
 // Bounds of the log-odds in the cells around some points, given half of their edges.
 template <class T, int D>
@@ -112,7 +112,6 @@ struct BoundVisitor final : Visitor<T, D> {
 template <class T, int D>
 class ClearCells {
  public:
-
   // A tree over a box, map frame [m], with leaves of some edge; cells of more than `largest` leaves an
   // edge are not bounded.
   ClearCells(const Box<double, D>& box, double leaf, int largest, double target_)
@@ -128,7 +127,7 @@ class ClearCells {
     nodes.assign(1, Node{-1, State::mixed});
   }
 
-  // Where a point is. 
+  // A point lies in a cell that is clear, or in one that may not be, or its bound is not known yet.
   enum class Place : int8_t { clear, mixed, waiting };
 
   // Looks up the cell of a point; where it is clear, `low` and `high` are its corners.

@@ -43,4 +43,41 @@ bool factor(const T* scatter, double count, double floor, Matrix<D> lower) {
   return product > 0;
 }
 
+// inv(before) raw-factor, in place of the factor: forward substitution, column by column.
+template <int D>
+void solve(const Matrix<D> before, Matrix<D> factors) {
+  for (int column = 0; column < D; ++column)
+    for (int i = column; i < D; ++i) {
+      double rest = factors[i][column];
+      for (int j = column; j < i; ++j) rest -= before[i][j] * factors[j][column];
+      factors[i][column] = rest / before[i][i];
+    }
+}
+
+// A raw factor moved by the change of the moments, in place: L -> after inv(before) L, as
+// `cluster_matching.moved_factors`; without a scatter before: the factor of the moments. False where
+// a covariance is not positive definite.
+template <int D, class T, class After>
+bool moved_factor(const T* scatter_before, double count_before, const After* scatter_after,
+                  double count_after, double floor, T* raw) {
+  Matrix<D> before, after, tuned = {};
+  bool definite = factor<D>(scatter_after, count_after, floor, after);
+  if (scatter_before) {
+    definite = factor<D>(scatter_before, count_before, floor, before) && definite;
+    for (int i = 0; i < D; ++i)
+      for (int j = 0; j <= i; ++j)
+        tuned[i][j] = i == j ? std::exp(double(raw[i * D + i])) : double(raw[i * D + j]);
+    solve<D>(before, tuned);
+  } else {
+    for (int d = 0; d < D; ++d) tuned[d][d] = 1;
+  }
+  for (int i = 0; i < D; ++i)
+    for (int j = 0; j < D; ++j) {
+      double sum = 0;
+      for (int m = j; m <= i; ++m) sum += after[i][m] * tuned[m][j];
+      raw[i * D + j] = T(i == j ? std::log(sum) : sum);
+    }
+  return definite;
+}
+
 }  // namespace lardhm

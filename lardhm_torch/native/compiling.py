@@ -27,7 +27,18 @@ FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
 # a unit, torch's, which only the last includes, two more.
 UNITS = (
     ("query", "kmeans", "gradients", "descent", "mixture", "tuning"),
-    ("raycast", "expected_range", "update", "pooling", "evidence", "cells", "marching", "ridge"),
+    (
+        "raycast",
+        "expected_range",
+        "update",
+        "pooling",
+        "evidence",
+        "kept",
+        "cells",
+        "passages",
+        "marching",
+        "ridge",
+    ),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
     ("bindings", "threads"),

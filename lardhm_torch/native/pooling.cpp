@@ -11,17 +11,6 @@
 namespace lardhm {
 namespace {
 
-// inv(before) raw-factor, in place of the factor: forward substitution, column by column.
-template <int D>
-void solve(const Matrix<D> before, Matrix<D> factors) {
-  for (int column = 0; column < D; ++column)
-    for (int i = column; i < D; ++i) {
-      double rest = factors[i][column];
-      for (int j = column; j < i; ++j) rest -= before[i][j] * factors[j][column];
-      factors[i][column] = rest / before[i][i];
-    }
-}
-
 // One cluster: the moments of the union, the center and the factor moved as they moved.
 template <class T, int D>
 struct Pooled {
@@ -45,20 +34,8 @@ struct Pooled {
 
   // False where a covariance is not positive definite.
   bool move(const T* scatter_before, int64_t known, double floor, const T* raw, T* to) const {
-    Matrix<D> before, after, tuned;
-    const bool definite = factor<D>(scatter_before, double(known), floor, before) &&
-                          factor<D>(scatter, count, floor, after);
-    for (int i = 0; i < D; ++i)
-      for (int j = 0; j <= i; ++j)
-        tuned[i][j] = i == j ? std::exp(double(raw[i * D + i])) : double(raw[i * D + j]);
-    solve<D>(before, tuned);
-    for (int i = 0; i < D; ++i)
-      for (int j = 0; j < D; ++j) {
-        double sum = 0;
-        for (int m = j; m <= i; ++m) sum += after[i][m] * tuned[m][j];
-        to[i * D + j] = T(i == j ? std::log(sum) : sum);
-      }
-    return definite;
+    std::copy_n(raw, D * D, to);
+    return moved_factor<D>(scatter_before, double(known), scatter, count, floor, to);
   }
 };
 

@@ -19,7 +19,8 @@
 namespace lardhm {
 
 constexpr int kStride = 4;          // steps whose log-odds are evaluated at a time; of a leaf
-constexpr int kLargestCell = 16;    // leaves along an edge of the largest cells that are bounded
+constexpr int kLargestCell = 4;     // leaves along an edge of the largest cells that are bounded
+constexpr int kAround = 16;         // and of a cube that would hold k evenly spread clusters, or more
 constexpr double kAhead = 0.1;      // of the longest range, where rays are sorted by place
 constexpr int64_t kWave = 1 << 15;  // rays that advance together
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
@@ -141,12 +142,11 @@ struct Wave {
   }
 
  private:
-  // Edge of the leaves [m]: a few steps; where these are tiny, as much that a largest cell would hold
-  // about k clusters if they were spread evenly.
+  // Edge of the leaves [m]: a few steps, but not tiny ones compared with the distances of clusters.
   static double leaf(const Header& header, int64_t k, double step) {
     double volume = double(k) / double(header.count);
     for (int d = 0; d < D; ++d) volume *= header.high[d] - header.low[d];
-    return std::max(kStride * step, std::pow(volume, 1.0 / D) / kLargestCell);
+    return std::max(kStride * step, std::pow(volume, 1.0 / D) / kAround);
   }
 
   void round() {

@@ -60,6 +60,7 @@ using Tensors = std::array<Tensor, N>;
 Tensor new_empty(const Tensor& like, const Sizes& sizes);
 Tensor new_empty(const Tensor& like, const Sizes& sizes, ScalarType type);
 Tensor new_zeros(const Tensor& like, const Sizes& sizes);
+Tensor new_zeros(const Tensor& like, const Sizes& sizes, ScalarType type);
 Tensor contiguous(const Tensor& tensor);
 Tensor fill(const Tensor& tensor, double value);
 
@@ -81,6 +82,7 @@ bool unbox<bool>(Slot slot);
 
 Slot box(const Tensor& tensor);
 Slot box(bool value);
+Slot box(int64_t value);
 
 template <class Result>
 void store(const Result& result, Slot* stack) {

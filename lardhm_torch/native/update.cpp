@@ -1,4 +1,5 @@
-// Updates with scans: the cluster that a point belongs to, and the clusters that a scan can change.
+// Updates with scans: the cluster that a point belongs to, the clusters that points are close to, and
+// those that a scan can change.
 
 #include <algorithm>
 #include <atomic>
@@ -96,6 +97,63 @@ Tensor nearest_clusters(const Tensor& given_points, const Tensor& given_counts,
   return owners;
 }
 
+// Sums over points of the kernel values of each cluster, those of one thread.
+template <class T, int D>
+struct SumVisitor final : Visitor<T, D> {
+  const int32_t* order;
+  const T *positions, *shapes;
+  std::vector<double> sums;  // by rank
+
+  SumVisitor(const Parameters<T, D>& parameters, int64_t count)
+      : order(parameters.index.order), positions(parameters.positions.data),
+        shapes(parameters.shapes.data), sums(count) {}
+
+  void invalid(int64_t) override {}
+
+  void packet(const Packet<T, D>& packet, const Selection& selected) override {
+    for (int64_t j = 0; j < selected.size; ++j) {
+      const int64_t rank = selected.rank[j];
+      const auto value = feature_of<T, D>(packet, positions + rank * Layout<D>::position,
+                                          shapes + rank * Layout<D>::shape);
+      T lanes[Simd<T>::W];
+      std::memcpy(lanes, &value, sizeof(value));
+      for (uint32_t bits = selected.bits[j]; bits; bits &= bits - 1)
+        sums[rank] += double(lanes[__builtin_ctz(bits)]);
+    }
+  }
+};
+
+Tensor feature_sums(const Tensor& given_points, const Tensor& centers, const Tensor& raw,
+                    const Tensor& index, int64_t k, double covariance_scale,
+                    double min_lengthscale) {
+  check_k(k);
+  const Tensor points = tidy(given_points);
+  check_rows("points", points, centers);
+  const int64_t n = points.size(0), count = centers.size(0);
+  const Tensor weights = new_zeros(centers, {count});
+  const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
+  const Tensor sums = new_zeros(map.centers, {count});
+  k = std::min(k, count);
+  if (n == 0 || k == 0) return sums;
+  dispatch(map.centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    with_parameters<T, D>(map, n, [&](Parameters<T, D>& parameters) {
+      std::vector<SumVisitor<T, D>> visitors;
+      for (int64_t part = 0; part < parts_of(n, 8 * count, parameters); ++part)
+        visitors.emplace_back(parameters, count);
+      visit_parts<T, D>(in<T>(points), n, parameters, k, each_of<T, D>(visitors));
+      for (int64_t rank = 0; rank < count; ++rank) {
+        double sum = 0;
+        for (const auto& visitor : visitors) sum += visitor.sums[rank];
+        out<T>(sums)[parameters.index.order[rank]] = T(sum);
+      }
+    });
+    return 0;
+  });
+  return sums;
+}
+
 // Whether a kernel's extent along every axis, `stds` standard deviations, meets the box.
 template <class T, int D>
 struct Extents {
@@ -156,6 +214,9 @@ std::vector<Operator> update_operators() {
       {"nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
        "float radius) -> Tensor",
        &boxed<nearest_clusters>},
+      {"feature_sums(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
+       "float covariance_scale, float min_lengthscale) -> Tensor",
+       &boxed<feature_sums>},
       {"reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
        "float covariance_scale, float min_lengthscale) -> Tensor",
        &boxed<reaching>},

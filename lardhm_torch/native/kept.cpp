@@ -1,0 +1,255 @@
+// Points kept by clusters: their number, moments, and clusters that follow them; see
+// `learning/evidence.py`.
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <unordered_set>
+#include <vector>
+
+#include "clusters.h"
+
+namespace lardhm {
+namespace {
+
+constexpr int64_t kGrain = 512;
+
+template <class Work>
+void for_rows(int64_t count, const Work& work) {
+  run_tasks((count + kGrain - 1) / kGrain, [&](int64_t task) {
+    const int64_t end = std::min(count, (task + 1) * kGrain);
+    for (int64_t row = task * kGrain; row < end; ++row) work(row);
+  });
+}
+
+void check_evidence(const Tensor& evidence) {
+  check(evidence.dim() == 3 && (evidence.size(2) == 2 || evidence.size(2) == 3),
+        "evidence must be (M, E, 2) or (M, E, 3)");
+}
+
+// Calls use(T, D) for the dtype and dimension of evidence.
+template <class Use>
+void with_evidence(const Tensor& evidence, const Use& use) {
+  check_evidence(evidence);
+  const bool wide = evidence.scalar_type() == ScalarType::Double;
+  check(wide || evidence.scalar_type() == ScalarType::Float,
+        "evidence must be float32 or float64");
+  const auto of_type = [&](auto type) {
+    if (evidence.size(2) == 2)
+      use(type, std::integral_constant<int, 2>{});
+    else
+      use(type, std::integral_constant<int, 3>{});
+  };
+  wide ? of_type(double{}) : of_type(float{});
+}
+
+// Kept points come first; the rest is infinity.
+template <class T, int D>
+int64_t count_kept(const T* points, int64_t size) {
+  const auto is_kept = [&](int64_t i) { return points[i * D] != std::numeric_limits<T>::infinity(); };
+  if (size == 0 || is_kept(size - 1)) return size;
+  int64_t low = 0, high = size - 1;  // the first one missing is in low .. high
+  while (low < high) {
+    const int64_t middle = (low + high) / 2;
+    if (is_kept(middle))
+      low = middle + 1;
+    else
+      high = middle;
+  }
+  return low;
+}
+
+Tensor kept_counts(const Tensor& given) {
+  const Tensor evidence = tidy(given);
+  const int64_t count = evidence.size(0), size = evidence.size(1);
+  const Tensor counts = new_empty(evidence, {count}, ScalarType::Long);
+  with_evidence(evidence, [&](auto type, auto dim) {
+    using T = decltype(type);
+    for_rows(count, [&](int64_t row) {
+      out<int64_t>(counts)[row] =
+          count_kept<T, dim()>(in<T>(evidence) + row * size * dim(), size);
+    });
+  });
+  return counts;
+}
+
+Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows) {
+  const Tensor evidence = tidy(given), rows = tidy(given_rows);
+  check(rows.scalar_type() == ScalarType::Long, "rows must be int64");
+  const int64_t count = rows.numel(), size = evidence.size(1);
+  for (int64_t i = 0; i < count; ++i)
+    check(in<int64_t>(rows)[i] >= 0 && in<int64_t>(rows)[i] < evidence.size(0),
+          "rows must be those of the evidence");
+  std::vector<int64_t> first(count + 1, 0);
+  Tensor points, owners;
+  with_evidence(evidence, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const T* all = in<T>(evidence);
+    for (int64_t i = 0; i < count; ++i)
+      first[i + 1] = first[i] + count_kept<T, D>(all + in<int64_t>(rows)[i] * size * D, size);
+    points = new_empty(evidence, {first[count], D});
+    owners = new_empty(evidence, {first[count]}, ScalarType::Long);
+    for_rows(count, [&](int64_t i) {
+      const int64_t row = in<int64_t>(rows)[i], kept = first[i + 1] - first[i];
+      std::copy_n(all + row * size * D, kept * D, out<T>(points) + first[i] * D);
+      std::fill_n(out<int64_t>(owners) + first[i], kept, row);
+    });
+  });
+  return {points, owners};
+}
+
+// Of the points of each cluster, the number of those that it keeps already.
+Tensor kept_again(const Tensor& given_points, const Tensor& given_owners, const Tensor& given) {
+  const Tensor points = tidy(given_points), owners = tidy(given_owners), evidence = tidy(given);
+  const int64_t n = points.size(0), count = evidence.size(0), size = evidence.size(1);
+  check(owners.scalar_type() == ScalarType::Long && owners.numel() == n &&
+            points.scalar_type() == evidence.scalar_type() && points.size(1) == evidence.size(2),
+        "points must be (N, D) like the evidence, owners (N,) int64");
+  const Tensor again = new_zeros(evidence, {count}, ScalarType::Long);
+  with_evidence(evidence, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    for (int64_t i = 0; i < n; ++i) {
+      const int64_t row = in<int64_t>(owners)[i];
+      if (row < 0 || row >= count) continue;
+      const T *point = in<T>(points) + i * D, *kept = in<T>(evidence) + row * size * D;
+      for (int64_t j = 0; j < size; ++j, kept += D)
+        if (std::equal(point, point + D, kept)) {
+          ++out<int64_t>(again)[row];
+          break;
+        }
+    }
+  });
+  return again;
+}
+
+// Moments of the kept points of one cluster, in double precision.
+template <class T, int D>
+struct KeptMoments {
+  double count, mean[D], scatter[D * D];
+
+  KeptMoments(const T* points, int64_t size) {
+    const int64_t kept = count_kept<T, D>(points, size);
+    double sum[D] = {};
+    count = double(kept);
+    std::fill_n(scatter, D * D, 0.0);
+    for (int64_t i = 0; i < kept; ++i)
+      for (int d = 0; d < D; ++d) sum[d] += double(points[i * D + d]) - double(points[d]);
+    for (int d = 0; d < D; ++d)
+      mean[d] = double(points[d]) + sum[d] / std::max(count, 1.0);
+    for (int64_t i = 0; i < kept; ++i)
+      for (int a = 0; a < D; ++a)
+        for (int b = 0; b <= a; ++b)
+          scatter[a * D + b] += (double(points[i * D + a]) - mean[a]) * (double(points[i * D + b]) - mean[b]);
+    for (int a = 0; a < D; ++a)
+      for (int b = 0; b < a; ++b) scatter[b * D + a] = scatter[a * D + b];
+  }
+};
+
+using Moments = Tensors<3>;
+
+Moments kept_moments(const Tensor& given) {
+  const Tensor evidence = tidy(given);
+  const int64_t count = evidence.size(0), size = evidence.size(1), dim = evidence.size(2);
+  const Moments result{new_empty(evidence, {count}, ScalarType::Long),
+                       new_empty(evidence, {count, dim}),
+                       new_empty(evidence, {count, dim, dim})};
+  with_evidence(evidence, [&](auto type, auto dimension) {
+    using T = decltype(type);
+    constexpr int D = dimension();
+    for_rows(count, [&](int64_t row) {
+      const KeptMoments<T, D> found(in<T>(evidence) + row * size * D, size);
+      out<int64_t>(result[0])[row] = int64_t(found.count);
+      for (int d = 0; d < D; ++d) out<T>(result[1])[row * D + d] = T(found.mean[d]);
+      for (int i = 0; i < D * D; ++i)
+        out<T>(result[2])[row * D * D + i] = T(found.scatter[i]);
+    });
+  });
+  return result;
+}
+
+// Clusters that follow their kept points: (centers, means, scatters, raw factors).
+Tensors<4> follow_kept(
+    const Tensor& given, const Tensor& given_counts, const Tensor& given_centers,
+    const Tensor& given_means, const Tensor& given_scatters, const Tensor& given_raw,
+    const Tensor& given_known, double floor) {
+  const Tensor evidence = tidy(given), counts = tidy(given_counts), known = tidy(given_known);
+  const Tensor centers = copy_of(given_centers), means = copy_of(given_means);
+  const Tensor scatters = copy_of(given_scatters), raw = copy_of(given_raw);
+  check_moments(counts, means, scatters, centers);
+  check_moments(counts, means, raw, centers);
+  const int64_t count = evidence.size(0), size = evidence.size(1);
+  check(means.size(0) == count && known.numel() == count &&
+            known.scalar_type() == ScalarType::Bool && evidence.size(2) == means.size(1) &&
+            evidence.scalar_type() == means.scalar_type(),
+        "evidence (M, E, D) and known (M,) bool must be of the size of the clusters");
+  std::atomic<bool> definite{true};
+  with_evidence(evidence, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    for_rows(count, [&](int64_t row) {
+      const KeptMoments<T, D> found(in<T>(evidence) + row * size * D, size);
+      if (found.count == 0) return;
+      const double represented = double(in<int64_t>(counts)[row]);
+      const double share = std::max(represented - 1, 1.0) / std::max(found.count - 1, 1.0);
+      T *mean = out<T>(means) + row * D, *center = out<T>(centers) + row * D;
+      T *scatter = out<T>(scatters) + row * D * D, before[D * D];
+      std::copy_n(scatter, D * D, before);
+      for (int d = 0; d < D; ++d) {
+        center[d] += T(found.mean[d]) - mean[d];
+        mean[d] = T(found.mean[d]);
+      }
+      for (int i = 0; i < D * D; ++i) scatter[i] = T(found.scatter[i] * share);
+      const bool is_known = in<bool>(known)[row];
+      if (!moved_factor<D>(is_known ? before : nullptr, represented, scatter, represented, floor,
+                           out<T>(raw) + row * D * D))
+        definite = false;
+    });
+  });
+  check(definite, "a covariance is not positive definite");
+  return {centers, means, scatters, raw};
+}
+
+// Number of cells of a lattice that hold points.
+int64_t count_cells(const Tensor& given_points, double edge) {
+  const Tensor points = tidy(given_points);
+  check(edge > 0, "edge must be > 0");
+  int64_t count = 0;
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const int64_t n = points.size(0);
+    std::unordered_set<uint64_t> cells;
+    uint64_t last = ~uint64_t(0);
+    for (int64_t i = 0; i < n; ++i) {
+      uint64_t key = 0;
+      for (int d = D - 1; d >= 0; --d)
+        key = (key << 21) + uint64_t(int64_t(std::floor(in<T>(points)[i * D + d] / T(edge))));
+      if (key == last && i) continue;
+      cells.insert(last = key);
+    }
+    count = int64_t(cells.size());
+    return 0;
+  });
+  return count;
+}
+
+}  // namespace
+
+std::vector<Operator> kept_operators() {
+  return {
+      {"kept_counts(Tensor evidence) -> Tensor", &boxed<kept_counts>},
+      {"kept_points(Tensor evidence, Tensor rows) -> (Tensor, Tensor)", &boxed<kept_points>},
+      {"kept_again(Tensor points, Tensor owners, Tensor evidence) -> Tensor", &boxed<kept_again>},
+      {"kept_moments(Tensor evidence) -> (Tensor, Tensor, Tensor)", &boxed<kept_moments>},
+      {"follow_kept(Tensor evidence, Tensor counts, Tensor centers, Tensor means, Tensor scatters, "
+       "Tensor raw_scale_tril, Tensor known, float floor) -> (Tensor, Tensor, Tensor, Tensor)",
+       &boxed<follow_kept>},
+      {"count_cells(Tensor points, float edge) -> int", &boxed<count_cells>},
+  };
+}
+
+}  // namespace lardhm
