@@ -27,7 +27,7 @@ FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
 # last two do without.
 UNITS = (
     ("query", "kmeans", "gradients", "descent", "mixture", "tuning"),
-    ("raycast", "update", "pooling", "evidence", "cells", "marching", "ridge", "threads"),
+    ("raycast", "update", "pooling", "evidence", "kept", "cells", "marching", "ridge", "threads"),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
 )
