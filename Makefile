@@ -9,7 +9,7 @@
 # make versions  try that wheel with old and new versions of Python and the libraries (gigabytes)
 # make sanitize  run the native tests with AddressSanitizer and UndefinedBehaviorSanitizer (minutes)
 # make bench     run the benchmarks (minutes)
-# make soak      run the long tests: fuzzing, flipped bits, kills, full disks (tens of minutes)
+# make soak      run the long tests: extras, fuzzing, flipped bits, kills, full disks (tens of minutes)
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -28,6 +28,8 @@ LONG := tests/test_streaming.py::test_a_stream_killed_at_any_moment_ends_as_if_i
 	tests/test_torch_func.py::test_an_exported_map_loads_in_a_new_process \
 	tests/test_collision.py::test_gradients_pass_gradcheck_for_ways_and_for_the_map \
 	tests/test_bodies.py::test_gradients_with_respect_to_poses_pass_gradcheck
+# `make test` skips what needs large libraries that are not installed for it.
+EXTRAS := tests/test_onnx_files.py tests/test_rerun_files.py tests/test_kiss_icp_poses.py
 export MPLBACKEND := Agg
 
 .PHONY: demo test check bench soak docs wheel try-wheel versions sanitize
@@ -46,6 +48,10 @@ export MPLBACKEND := Agg
 
 .venv/bench: .venv/ready
 	$(INSTALL) -e '.[bench]'
+	touch $@
+
+.venv/extras: .venv/ready
+	$(INSTALL) -e '.[onnx,rerun,kiss-icp]'
 	touch $@
 
 .venv/wheel: .venv/ready
@@ -90,8 +96,8 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/accuracy.py
 
-soak: .venv/ready
-	$(BIN)/python -m pytest $(LONG)
+soak: .venv/extras
+	$(BIN)/python -m pytest $(LONG) $(EXTRAS)
 	$(BIN)/python scripts/fuzz_readers.py
 	$(BIN)/python scripts/soak_bits.py --flips 1000 --seed 0
 	$(BIN)/python scripts/soak_kills.py --kills 50 --seed 0

@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.io.mesh_files import save_mesh as save_mesh
     from lardhm_torch.io.nav2_files import save_nav2 as save_nav2
     from lardhm_torch.io.notes import ScanReport as ScanReport
+    from lardhm_torch.io.onnx_files import save_onnx as save_onnx
     from lardhm_torch.io.scan_files import iter_scans as iter_scans
     from lardhm_torch.io.scan_files import load_points as load_points
     from lardhm_torch.io.scan_files import load_scans as load_scans
@@ -39,8 +40,8 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.queries.collision import segment_hazard as segment_hazard
     from lardhm_torch.queries.distance import signed_distance as signed_distance
     from lardhm_torch.queries.distance import surface_distance as surface_distance
-    from lardhm_torch.queries.exploration import frontiers as frontiers
     from lardhm_torch.queries.exploration import information_gain as information_gain
+    from lardhm_torch.queries.frontiers import frontiers as frontiers
     from lardhm_torch.queries.grids import grid as grid
     from lardhm_torch.queries.grids import query_grid as query_grid
     from lardhm_torch.queries.grids import query_slice as query_slice
@@ -70,6 +71,7 @@ _NAMES = {
     "io.mesh_files": ["save_mesh"],
     "io.nav2_files": ["save_nav2"],
     "io.notes": ["ScanReport"],
+    "io.onnx_files": ["save_onnx"],
     "io.scan_files": ["iter_scans", "load_points", "load_scans", "save_scans"],
     "learning.fine_tuning": ["TuneConfig", "fine_tune"],
     "learning.fitting": ["FitConfig"],
@@ -87,7 +89,8 @@ _NAMES = {
     "queries.clearance": ["clearance"],
     "queries.collision": ["Mover", "expected_range", "free_probability", "segment_hazard"],
     "queries.distance": ["signed_distance", "surface_distance"],
-    "queries.exploration": ["frontiers", "information_gain"],
+    "queries.exploration": ["information_gain"],
+    "queries.frontiers": ["frontiers"],
     "queries.grids": ["grid", "query_grid", "query_slice"],
     "queries.raycasting": ["raycast"],
     "sampling": ["Samples", "SamplingConfig", "sample_rays"],

@@ -106,7 +106,7 @@ class MapQueries(parameters.MapParameters):
         Raises:
             ValueError: the map has no classes.
         """
-        return torch.softmax(self.class_log_odds(points), dim=-1)
+        return channel_queries.class_probability(self, points)
 
     @reads_map
     def class_posterior(self, points: TensorLike) -> Tensor:
@@ -115,8 +115,8 @@ class MapQueries(parameters.MapParameters):
         Raises:
             ValueError: the map has no classes.
         """
-        occupied = self._query(points, probability=True)[..., None]
-        return torch.cat([1 - occupied, occupied * self.class_probability(points)], dim=-1)
+        occupied = self._query(points, probability=True)
+        return channel_queries.joint_posterior(occupied, self.class_probability(points))
 
     @property
     def classes(self) -> list[int]:

@@ -178,6 +178,12 @@ def stored_moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor, Tensor]
     return is_occupied, counts, means, scatters
 
 
+def kept_hits(model: OccupancyMap) -> Tensor | None:
+    """(M, K, D) points that the clusters keep, map frame, padded with infinity; None if not stored."""
+    evidence = getattr(model, "evidence", None)
+    return None if evidence is None or evidence.shape[1] == 0 else evidence.detach()
+
+
 def native_map(model: OccupancyMap) -> NativeMap | None:
     """The tensors of the map for `native.surfaces` by its ``native_map``; None if not available."""
     return model.native_map() if hasattr(model, "native_map") else None

@@ -16,7 +16,8 @@ from torch import Tensor
 from lardhm_torch import LardHilbertMap, raycast, sample_rays, simulate_room
 from lardhm_torch.queries.clearance import clearance
 from lardhm_torch.queries.collision import Mover, expected_range, free_probability
-from lardhm_torch.queries.exploration import frontiers, information_gain
+from lardhm_torch.queries.exploration import information_gain
+from lardhm_torch.queries.frontiers import frontiers
 from lardhm_torch.queries.grids import grid, occupancy_gradient, query_slice
 
 HEIGHT = 1.1  # [m]

@@ -61,6 +61,26 @@ def test_the_distance_of_a_body_is_that_of_dense_points_on_its_spheres(room):
     assert agree.double().mean() > 0.94
 
 
+def test_the_probability_of_a_body_is_that_of_dense_points_on_its_spheres(room):
+    """Of a point, P(distance < 0) is the probability that the surface has moved beyond it."""
+    body, poses = robot(), random_poses(150, 1)
+    distance = body_distance(room, body, poses)
+    poses = poses[(distance > 0) & (distance < 0.1)]
+    found = body_collision_probability(room, body, poses)
+    centers = body.placed(poses).requires_grad_()
+    (away,) = torch.autograd.grad(signed_distance(room, centers).sum(), centers)
+    around = away[:, :, None] + 0.1 * torch.randn(1, 1, 500, 3, dtype=F64)  # toward the surface
+    ways = torch.cat(
+        [-away[:, :, None], -around, sphere_points(500).expand(*away.shape[:2], -1, 3)], 2
+    )
+    ways = ways / ways.norm(dim=-1, keepdim=True)
+    shell = centers.detach()[:, :, None] + body.radii[:, None, None] * ways
+    dense = collision_probability(room, shell, 0.0)
+    dense = torch.where(signed_distance(room, shell) < 0, 0.0, dense)  # a pocket never seen
+    assert ((found > 0.01) & (found < 0.99)).sum() > 3
+    torch.testing.assert_close(found, dense.flatten(1).amax(dim=1), rtol=0, atol=1e-3)
+
+
 def test_the_distance_of_a_capsule_is_that_of_dense_points_on_its_axis(room):
     starts, ends = places(60, 2), places(60, 3)
     found = capsule_distance(room, starts, ends, 0.1)

@@ -148,3 +148,12 @@ def test_the_classes_of_a_room_survive_wrong_labels_at_once_and_scan_by_scan():
         assert found[name] > 0.95  # .97 with the 50,000 rays of the benchmark
         assert expected_calibration_error(probability, true) < 0.03
     assert found["stream"] > found["batch"] - 0.01
+
+
+def test_packed_maps_do_not_learn_classes(tmp_path):
+    points, classes = blobs()
+    LardHilbertMap(2).fit_classes(points, classes).pack(tmp_path / "map.lhm")
+    model = LardHilbertMap.load(tmp_path / "map.lhm")
+    for change in (model.fit_classes, model.calibrate_classes):
+        with pytest.raises(ValueError, match="a packed map answers but does not learn"):
+            change(points, classes)

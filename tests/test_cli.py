@@ -458,11 +458,6 @@ def test_tiles_need_a_usable_ray(bad, tmp_path, capsys):
     assert "at least one usable ray" in error
 
 
-def test_tiles_say_which_channels_they_leave_out(folder, tmp_path, capsys):
-    run("tile", folder / "train.npz", "-o", tmp_path / "tiles", "--edge", 4)
-    assert "color, class left out (tiles hold occupancy only)" in capsys.readouterr().out
-
-
 def test_a_warning_is_one_line_without_its_source(capsys, monkeypatch):
     def info(arguments):
         """Show what a warning would look like."""

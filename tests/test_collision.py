@@ -153,16 +153,38 @@ def test_a_sphere_s_expected_range_follows_from_the_hazard_of_its_segments():
     assert float(found) == pytest.approx(float(expected), abs=2e-3)
 
 
-def test_the_native_march_passes_over_no_hazard(monkeypatch):
+@pytest.mark.parametrize("follows", [False, True])
+def test_native_rays_pass_over_no_hazard(monkeypatch, follows):
+    """In one native pass, or with gradients, from step to step."""
     samples = sample_rays(simulate_room(3000))
     model = LardHilbertMap().fit(samples.points, samples.labels).requires_grad_(False)
     starts = torch.tensor([4.4, 2.8, 1.1]).double()
     toward = torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).double()
-    found = expected_range(model, starts, toward, 6.0)
+    toward.requires_grad_(follows)
+    found = expected_range(model, starts, toward, 6.0).detach()
     monkeypatch.setattr(marching, "native_ranges", lambda *_: None)
-    expected = expected_range(model, starts, toward, 6.0)
+    monkeypatch.setattr(marching, "native_map", lambda *_: None)
+    expected = expected_range(model, starts, toward, 6.0).detach()
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-2)
     assert float((found - expected).abs().median()) < 1e-4
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_native_expected_ranges_are_those_of_the_loop(monkeypatch, dim):
+    """Also for cells as large as the map, thin clusters, and ranges that are no multiple of the step."""
+    rng = torch.Generator().manual_seed(dim)
+    points = torch.randn(3000, dim, generator=rng).double()
+    model = LardHilbertMap(dim, num_neighbors=5).double()
+    model.fit(points, (points[:, 0].sin() > 0).double(), 40).requires_grad_(False)
+    starts, toward = 2 * torch.randn(2, 300, dim, generator=rng).double()
+    rule = Mover(step=0.03, length=1.0)
+    found = expected_range(model, starts, toward, 4.01, rule)
+    monkeypatch.setattr(marching, "native_ranges", lambda *_: None)
+    monkeypatch.setattr(marching, "native_map", lambda *_: None)
+    torch.testing.assert_close(
+        found, expected_range(model, starts, toward, 4.01, rule), rtol=0, atol=5e-3
+    )
+    assert float((found < 4).double().mean()) > 0.2
 
 
 @pytest.mark.parametrize(

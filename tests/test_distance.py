@@ -8,7 +8,7 @@ from tiled_maps import tiled
 
 from lardhm_torch import LardHilbertMap, native, sample_rays, signed_distance, simulate_room
 from lardhm_torch.features import raw_factors
-from lardhm_torch.queries import distance as module
+from lardhm_torch.queries import nearest_face as module
 from lardhm_torch.queries.distance import surface_distance
 from lardhm_torch.queries.faces import surface_faces
 
@@ -154,8 +154,10 @@ def test_free_space_is_in_front_of_the_room_s_surfaces(room):
     assert (signed_distance(room, outside) < 0).all()
 
 
-def test_tiles_answer_as_the_whole_map(room, tmp_path, monkeypatch):
+def test_tiles_answer_as_the_whole_map_without_its_kept_hits(room, tmp_path, monkeypatch):
     tiles = tiled(room, tmp_path, monkeypatch, edge=2.0)
+    room.save(tmp_path / "map.pt", evidence=False)
+    room = LardHilbertMap.load(tmp_path / "map.pt").requires_grad_(False)
     points = places(60, 7).requires_grad_()
     points.data[0] = 40.0  # far outside
     for most in (math.inf, 0.7):
@@ -175,6 +177,19 @@ def test_after_an_update_the_distances_are_those_of_a_map_asked_for_the_first_ti
         model.save(tmp_path / "map.pt")
         fresh = LardHilbertMap.load(tmp_path / "map.pt")
         torch.testing.assert_close(found, signed_distance(fresh, places(300, 8)))
+
+
+def test_kept_hits_far_from_every_face_are_surfaces_if_the_map_holds_them_to_be_occupied():
+    model = wall_of_tiles()
+    last = 35  # the tile in a corner, which ends at 0.6 m
+    model.evidence[last, 0] = torch.tensor([0.0, 0.68, 0.5])
+    model.evidence[last, 1] = torch.tensor([0.0, 0.5, 5.0])  # nothing is occupied there
+    model.evidence[0, 0] = model.centers[0]  # on a face
+    faces = surface_faces(model)
+    assert len(faces.centers) == len(surface_faces(wall_of_tiles()).centers) + 1
+    ahead = torch.tensor([[0.3, 0.68, 0.5]], dtype=F64)
+    assert float(surface_distance(wall_of_tiles(), ahead)) > 0.305
+    assert float(signed_distance(model, ahead)) == pytest.approx(0.3, abs=1e-6)
 
 
 def test_a_cluster_that_the_map_holds_to_be_free_is_no_surface():

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from drive_files import save_drive
 from small_maps import wall_map
 
 from lardhm_torch import (
@@ -14,8 +15,6 @@ from lardhm_torch import (
     cli,
     extract_mesh,
     iter_scans,
-    save_scans,
-    simulate_room,
     stream_scans,
 )
 from lardhm_torch.io.foxglove_files import TOPICS, foxglove_log
@@ -86,22 +85,13 @@ def cloud_of(message):
 
 @pytest.fixture
 def drive(tmp_path):
-    """A folder of the scans of a room far from zero, one file each."""
-    room = simulate_room(1500, seed=0)
-    shift = torch.tensor([4e5, 5e6, 0.0]).double()
-    (tmp_path / "drive").mkdir()
-    for number in range(room.num_scans):
-        seen = room.scan_id == number
-        place, ends = room.origins[number][None] + shift, room.ends[seen] + shift
-        scan = Scans(place, ends, None, room.is_return[seen])
-        save_scans(scan, tmp_path / "drive" / f"{number}.npz")
-    return tmp_path / "drive"
+    return save_drive(tmp_path / "drive")
 
 
 def test_the_command_line_writes_clouds_surfaces_and_grids(drive, tmp_path):
     words = [
         "fit", drive, "-o", tmp_path / "map.pt", "--incremental", "--mcap", tmp_path / "out.mcap",
-        "--mcap-every", 2, "--mcap-resolution", 0.2, "--heights", 0.3, 1.5,
+        "--log-every", 2, "--log-resolution", 0.2, "--heights", 0.3, 1.5,
     ]  # fmt: skip
     assert cli.main(list(map(str, words))) == 0
     found = read(tmp_path / "out.mcap")
@@ -203,8 +193,8 @@ def test_wrong_options_are_one_line(drive, tmp_path, capsys):
     out = tmp_path / "out.mcap"
     assert "--mcap must end in .mcap" in error_of("--incremental", "--mcap", tmp_path / "out.bag")
     assert "--mcap needs --incremental" in error_of("--mcap", out)
-    assert "--heights needs --mcap" in error_of("--incremental", "--heights", 0, 1)
-    wrong = ("--incremental", "--mcap", out, "--mcap-every", 0)
+    assert "--heights needs --mcap or --rerun" in error_of("--incremental", "--heights", 0, 1)
+    wrong = ("--incremental", "--mcap", out, "--log-every", 0)
     assert "every must be > 0; got 0" in error_of(*wrong)
     with foxglove_log(out) as log, pytest.raises(ValueError, match="scans must come through watch"):
         log.send(wall_map())

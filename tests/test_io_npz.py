@@ -76,10 +76,10 @@ def test_saving_through_a_link_replaces_what_it_points_to(tmp_path):
     assert len(load_scans(tmp_path / "there/scans.npz")) == 5
 
 
-def test_scans_are_saved_as_npz_only_and_only_into_a_folder_that_exists(tmp_path):
+def test_scans_are_saved_in_known_formats_only_and_only_into_a_folder_that_exists(tmp_path):
     scans = Scans(torch.zeros(1, 3), torch.ones(5, 3))
-    with pytest.raises(ValueError, match=r"path must end in \.npz"):
-        save_scans(scans, tmp_path / "scans.ply")
+    with pytest.raises(ValueError, match=r"path must end in one of \.npz, \.ply, \.pcd"):
+        save_scans(scans, tmp_path / "scans.las")
     with pytest.raises(FileNotFoundError, match=r"folder that exists.*nowhere"):
         save_scans(scans, tmp_path / "nowhere/scans.npz")
 

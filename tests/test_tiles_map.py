@@ -17,7 +17,7 @@ from tiled_maps import (
 from lardhm_torch import LardHilbertMap, TiledMap, extract_mesh, raycast, sample_rays
 from lardhm_torch.io.scan_files import load_scans
 from lardhm_torch.queries.collision import expected_range, segment_hazard
-from lardhm_torch.queries.exploration import frontiers
+from lardhm_torch.queries.frontiers import frontiers
 from lardhm_torch.queries.grids import map_bounds, occupancy_gradient, query_grid
 from lardhm_torch.queries.raycasting import surface_step, thickness_counts
 from lardhm_torch.scans import split_rays

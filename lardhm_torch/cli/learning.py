@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lardhm_torch.cli.outputs import MAP_SUFFIXES, check_output
+from lardhm_torch.cli.outputs import MAP_SUFFIXES, SCAN_OUTPUTS, check_output
 from lardhm_torch.cli.scan_files import (
     far_hits,
     iter_scans_of,
@@ -20,8 +20,9 @@ from lardhm_torch.cli.tiling import update_folder
 
 if TYPE_CHECKING:
     from lardhm_torch import LardHilbertMap, Samples, Scans
-    from lardhm_torch.io.foxglove_files import FoxgloveLog
+    from lardhm_torch.io.map_logs import MapLog
 
+LOGS = {"mcap": ".mcap", "rerun": ".rrd"}
 # Imports of torch are inside the functions: `lardhm --help` must be fast.
 
 
@@ -29,7 +30,7 @@ def simulate(arguments: argparse.Namespace) -> None:
     """Simulate scans of a furnished room."""
     from lardhm_torch import save_scans, simulate_room
 
-    check_output(arguments.output, (".npz",))
+    check_output(arguments.output, SCAN_OUTPUTS)
     scans = simulate_room(
         num_rays=arguments.rays,
         seed=arguments.seed,
@@ -45,7 +46,7 @@ def split(arguments: argparse.Namespace) -> None:
     from lardhm_torch import save_scans, split_rays
 
     for path in arguments.output:
-        check_output(path, (".npz",), arguments.scans)
+        check_output(path, SCAN_OUTPUTS, arguments.scans)
     if len({Path(path).resolve() for path in arguments.output}) == 1:
         raise ValueError(f"--output must be two different files; got {arguments.output[0]} twice")
     scans = read_scans(arguments)
@@ -63,8 +64,9 @@ def fit(arguments: argparse.Namespace) -> None:
     if arguments.tune_state is not None:
         inputs = [*arguments.scans, arguments.output]
         check_output(arguments.tune_state, MAP_SUFFIXES, inputs, option="--tune-state")
-    if arguments.mcap is not None:
-        check_output(arguments.mcap, (".mcap",), arguments.scans, option="--mcap")
+    for option in LOGS:
+        if (path := getattr(arguments, option)) is not None:
+            check_output(path, (LOGS[option],), arguments.scans, option=f"--{option}")
     if arguments.incremental:
         _fit_incrementally(arguments)
     else:
@@ -80,8 +82,9 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         raise ValueError(
             "--send and --precision need --incremental; `lardhm pack` packs a finished map"
         )
-    if arguments.mcap is not None:
-        raise ValueError("--mcap needs --incremental")
+    for option in LOGS:
+        if getattr(arguments, option) is not None:
+            raise ValueError(f"--{option} needs --incremental")
     state = _tune_state(arguments.tune_state)
     scans = read_scans(arguments)
     samples = sample_rays(scans, sampling_of(arguments), seed=arguments.seed)
@@ -179,9 +182,9 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
         scans, done = itertools.chain([first], scans), None
         model = _new_map(first.dim, arguments)
     send = _packet_writer(arguments)
-    with _live_view(arguments.view) as show, _foxglove_log(arguments) as log:
+    with _live_view(arguments.view) as show, ExitStack() as stack:
         watchers = [watch for watch in (send, show) if watch is not None]
-        if log is not None:
+        for log in [stack.enter_context(start) for start in _map_logs(arguments)]:
             scans = log.watch(scans)
             watchers.append(log.send)
 
@@ -213,23 +216,27 @@ def _packet_writer(arguments: argparse.Namespace) -> Callable[[LardHilbertMap], 
     return PacketWriter(arguments.send, resume=arguments.resume, **settings).send
 
 
-@contextmanager
-def _foxglove_log(arguments: argparse.Namespace) -> Iterator[FoxgloveLog | None]:
-    """The writer of an MCAP file; None if not wanted."""
-    if arguments.mcap is None:
-        if arguments.heights is not None:
-            raise ValueError("--heights needs --mcap")
-        yield None
-        return
+def _map_logs(arguments: argparse.Namespace) -> list[AbstractContextManager[MapLog]]:
+    """Writers of the logs that are wanted, to be opened."""
     from lardhm_torch.io.foxglove_files import foxglove_log
+    from lardhm_torch.io.rerun_files import rerun_log
 
-    with foxglove_log(
-        arguments.mcap,
-        every=arguments.mcap_every,
-        resolution=arguments.mcap_resolution,
-        heights=arguments.heights and tuple(arguments.heights),
-    ) as log:
-        yield log
+    wanted = [
+        (path, start)
+        for path, start in ((arguments.mcap, foxglove_log), (arguments.rerun, rerun_log))
+        if path is not None
+    ]
+    if not wanted and arguments.heights is not None:
+        raise ValueError("--heights needs --mcap or --rerun")
+    return [
+        start(
+            path,
+            every=arguments.log_every,
+            resolution=arguments.log_resolution,
+            heights=arguments.heights and tuple(arguments.heights),
+        )
+        for path, start in wanted
+    ]
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 MAP_SUFFIXES = (".pt", ".pth", ".safetensors")
+SCAN_OUTPUTS = (".npz", ".ply", ".pcd")
 
 
 def check_output(

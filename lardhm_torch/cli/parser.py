@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _scan_verbs(verb: Any) -> None:
     sub = verb(learning.simulate)
-    _output(sub, "scans to write: .npz")
+    _output(sub, "scans to write: .npz, .ply or .pcd")
     sub.add_argument(
         "--rays", type=int, default=50_000, metavar="N", help="number of rays (default: 50000)"
     )
@@ -74,7 +74,7 @@ def _scan_verbs(verb: Any) -> None:
         nargs=2,
         required=True,
         metavar=("TRAIN", "TEST"),
-        help="scans to write: two .npz files",
+        help="scans to write: two .npz, .ply or .pcd files",
     )
 
 
@@ -124,32 +124,33 @@ def _fit(sub: argparse.ArgumentParser) -> None:
         "folder or at the end of a .lhm file",
     )
     _precision(sub)
+    for option, program in (("mcap", "Foxglove: .mcap"), ("rerun", "Rerun: .rrd")):
+        sub.add_argument(
+            f"--{option}",
+            metavar="FILE",
+            help=f"with --incremental: write clouds, growing surface and grid for {program}",
+        )
     sub.add_argument(
-        "--mcap",
-        metavar="FILE",
-        help="with --incremental: write clouds, growing surface and grid for Foxglove: .mcap",
-    )
-    sub.add_argument(
-        "--mcap-every",
+        "--log-every",
         type=int,
         default=10,
         metavar="N",
-        help="with --mcap: write surface and grid every N scans and at the end (default: 10)",
+        help="with --mcap or --rerun: write surface and grid every N scans and at the end (default: 10)",
     )
     sub.add_argument(
-        "--mcap-resolution",
+        "--log-resolution",
         type=float,
         default=0.1,
         metavar="METERS",
-        help="with --mcap: edge of a cell of surface and grid (default: 0.1)",
+        help="with --mcap or --rerun: edge of a cell of surface and grid (default: 0.1)",
     )
     sub.add_argument(
         "--heights",
         nargs=2,
         type=finite,
         metavar=("LOW", "HIGH"),
-        help="with --mcap: z of the lowest and highest obstacles in the grid of a 3-D map [m]; "
-        "without it there is no grid",
+        help="with --mcap or --rerun: z of the lowest and highest obstacles in the grid of a 3-D map "
+        "[m]; without it there is no grid",
     )
     _radius(sub)
     add_ranges(sub)
@@ -205,13 +206,10 @@ def _file_verbs(verb: Any) -> None:
     )
     _resolution(sub, 0.1)
     sub.add_argument(
-        "--distance",
-        action="store_true",
-        help="write signed distances to the nearest surface [m]; only .npz",
+        "--distance", action="store_true", help="signed distances to the nearest surface [m]; .npz"
     )
-    sub.add_argument(
-        "--sparse", action="store_true", help="with .npz: only blocks of cells near clusters"
-    )
+    sub.add_argument("--sparse", action="store_true", help="with .npz: only blocks near clusters")
+    sub.add_argument("--channel", metavar="NAME", help="with .npz: a channel to write, too")
     sub.add_argument(
         "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
     )

@@ -71,13 +71,15 @@ def grid(arguments: argparse.Namespace) -> None:
         raise ValueError("give --output or --nav2, or both")
     if arguments.nav2 is None and arguments.heights is not None:
         raise ValueError("--heights needs --nav2; a grid of --output has all heights")
-    for option in ("sparse", "distance"):
+    for option in ("sparse", "distance", "channel"):
         if getattr(arguments, option) and arguments.output is None:
             raise ValueError(f"--{option} needs --output")
     if arguments.output is not None:
         check_output(arguments.output, GRID_SUFFIXES, [arguments.map])
-        if arguments.distance and Path(arguments.output).suffix.lower() != ".npz":
-            raise ValueError(f"--output must end in .npz with --distance; got {arguments.output}")
+        for option in ("distance", "channel"):
+            if getattr(arguments, option) and Path(arguments.output).suffix.lower() != ".npz":
+                message = f"--output must end in .npz with --{option}; got {arguments.output}"
+                raise ValueError(message)
     if arguments.nav2 is not None:
         check_output(arguments.nav2, (".yaml", ".yml"), [arguments.map], option="--nav2")
     model = open_map(arguments.map)
@@ -98,6 +100,7 @@ def grid(arguments: argparse.Namespace) -> None:
             arguments.resolution,
             distance=arguments.distance,
             sparse=arguments.sparse,
+            channel=arguments.channel,
         )
         print(f"{count} cells of {arguments.resolution} m -> {arguments.output}")
 
@@ -303,6 +306,8 @@ def _info_of_folder(path: str) -> dict[str, Any]:
         "training points": sum(tile.num_points for tile in tiles),
         "origin [m]": list(manifest.origin),
     }
+    if manifest.channels:
+        rows["channels"] = list(manifest.channels)
     if tiles:
         corners = [
             [pick(axis) for axis in zip(*(tile.bounds[side] for tile in tiles), strict=True)]

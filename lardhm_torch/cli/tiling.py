@@ -28,14 +28,8 @@ def tile(arguments: argparse.Namespace) -> None:
     points = sum(counts.core for counts in ledger.tiles.values())
     print(
         f"{ledger.rays} rays, {points} points -> {len(ledger.cores)} tiles -> {arguments.output}; "
-        f"next: lardhm fit-tiles {arguments.output}{far_hits(arguments)}{_left_out(arguments)}"
+        f"next: lardhm fit-tiles {arguments.output}{far_hits(arguments)}"
     )
-
-
-def _left_out(arguments: argparse.Namespace) -> str:
-    """Which channels of the scans a tiled map does not hold, for the line that a verb ends with."""
-    names = ", ".join(arguments.report.channels)
-    return f"; {names} left out (tiles hold occupancy only)" if names else ""
 
 
 def fit_tiles(arguments: argparse.Namespace) -> None:
@@ -63,10 +57,7 @@ def update_folder(arguments: argparse.Namespace) -> None:
     dim = read_manifest(arguments.map).dim
     _, touched = add_scans(iter_pieces_of(arguments, dim), arguments.map, progress=True)
     manifest = fit_tiles(arguments.map, progress=True)
-    print(
-        f"{len(touched)} of {len(manifest.tiles)} tiles were updated -> {arguments.map}"
-        f"{_left_out(arguments)}"
-    )
+    print(f"{len(touched)} of {len(manifest.tiles)} tiles were updated -> {arguments.map}")
 
 
 def join(arguments: argparse.Namespace) -> None:

@@ -140,9 +140,7 @@ def ground_grid_message(found: GroundGrid, height: float, nanoseconds: int) -> d
     log_odds = found.log_odds.T
     cells = np.zeros(log_odds.shape, [("probability", "<f4"), ("color", "u1", 4)])
     cells["probability"] = 1 / (1 + np.exp(-log_odds))
-    known = ~np.isnan(log_odds)
-    cells["color"][known, :3] = np.round(255 * (1 - cells["probability"][known]))[:, None]
-    cells["color"][known, 3] = 255
+    cells["color"] = found.shades()
     colors = [
         {"name": name, "offset": 4 + i, "type": UINT8}
         for i, name in enumerate(("red", "green", "blue", "alpha"))

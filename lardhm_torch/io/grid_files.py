@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch.channels import CLASS
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.io.numpy_files import array_name
 from lardhm_torch.io.octrees import new_tree, to_array
 from lardhm_torch.maps import OccupancyMap, TensorLike, reads_copy
+from lardhm_torch.queries.channels import check_channel
 from lardhm_torch.queries.distance import signed_distance
 from lardhm_torch.queries.grids import (
     BLOCK_POINTS,
@@ -26,6 +30,7 @@ from lardhm_torch.queries.grids import (
     query_grid,
 )
 from lardhm_torch.queries.memory import check_memory
+from lardhm_torch.surfaces.channel_colors import channel_values, class_labels
 from lardhm_torch.surfaces.lattice import BLOCK_CELLS, Lattice, blocks_near_boxes
 
 GRID_SUFFIXES = (".bt", ".npz", ".ot")
@@ -43,6 +48,7 @@ def save_grid(
     *,
     distance: bool = False,
     sparse: bool = False,
+    channel: str | None = None,
 ) -> int:
     """Write the map as a grid of cells, in the format of the extension.
 
@@ -60,6 +66,10 @@ def save_grid(
     each, counted from the one at ``lower``. All other cells are unknown. It is written block by block,
     so memory does not grow with the map.
 
+    A ``channel`` of the map is written to a ``.npz`` beside the probability, as an array of the same
+    shape, named ``color``, ``intensity``, ``class`` or ``channel_NAME``: float32, (..., C) for C values,
+    NaN where unknown; of ``class`` the most likely class of each cell, int32, -1 where unknown.
+
     An OctoMap cell has the highest log-odds of the centers of its eight parts, since surfaces are
     thinner than cells and OctoMap too lets occupied win. It is known where they are 1 or more away
     from 0 (probability 0.27, 0.73).
@@ -71,14 +81,15 @@ def save_grid(
         bounds: lower and upper corner of the part to write, world frame [m]; None: all of it.
         distance: write signed distances to the nearest surface instead of probabilities.
         sparse: write a sparse ``.npz``, of a 3-D map.
+        channel: name of a channel to write, too, to ``.npz``.
 
     Returns:
         The number of cells written.
 
     Raises:
         ValueError: the extension is another (of distances: not .npz), the map is empty or has the
-            wrong dimension, the map lies outside what an OctoMap of this resolution spans, or the
-            grid would not fit in memory.
+            wrong dimension or no such channel, the map lies outside what an OctoMap of this
+            resolution spans, or the grid would not fit in memory.
         ImportError: an OctoMap is asked for and octomap-python is not installed.
         FileNotFoundError: the folder of path does not exist.
     """
@@ -86,8 +97,11 @@ def save_grid(
     if suffix not in GRID_SUFFIXES:
         known = ", ".join(GRID_SUFFIXES)
         raise ValueError(f"path must end in one of {known} for a grid; got {Path(path).name!r}")
-    if distance and suffix != ".npz":
-        raise ValueError(f"path must end in .npz for a grid of distances; got {Path(path).name!r}")
+    if (distance or channel is not None) and suffix != ".npz":
+        what = "of distances" if distance else "with a channel"
+        raise ValueError(f"path must end in .npz for a grid {what}; got {Path(path).name!r}")
+    if channel is not None:
+        check_channel(model, channel)
     if sparse and distance:
         raise ValueError("distances cannot be sparse; give distance or sparse")
     if sparse and (suffix != ".npz" or model.dim != 3):
@@ -101,7 +115,7 @@ def save_grid(
     first, last = (lower / resolution).floor(), (upper / resolution).ceil() - 1
     first_center, last_center = ((end + 0.5) * resolution for end in (first, last.maximum(first)))
     if sparse:
-        return _save_sparse(model, path, resolution, first_center, last_center)
+        return _save_sparse(model, path, resolution, first_center, last_center, channel)
     if suffix == ".npz":
         ask = _distance_grid if distance else query_grid
         values = ask(model, first_center, last_center, resolution)
@@ -110,14 +124,16 @@ def save_grid(
             "lower": (first * resolution).numpy(),
             "resolution": np.float64(resolution),
         }
-        with replaced_file(path) as partial, open(partial, "wb") as file:
+        if channel is not None:
+            name = array_name(channel)
+            arrays[name] = _channel_grid(model, first_center, last_center, resolution, channel)
+        with replaced_file(path) as unfinished, open(unfinished, "wb") as file:
             np.savez(file, **arrays)
         return values.numel()
     tree, count = _octomap_of(model, first_center, last_center, resolution)
+    content = tree.writeBinary() if suffix == ".bt" else tree.write()  # OctoMap ignores full disks
     with replaced_file(path) as partial:
-        write = tree.writeBinary if suffix == ".bt" else tree.write
-        if not write(os.fsencode(partial)):
-            raise OSError(f"{path} cannot be written")
+        partial.write_bytes(content)
     return count
 
 
@@ -134,6 +150,29 @@ def _distance_grid(model: OccupancyMap, first: Tensor, last: Tensor, resolution:
     )
 
 
+def cell_values(model: OccupancyMap, points: Tensor, channel: str) -> np.ndarray:
+    """(..., D) world positions [m] -> (...) or (..., C) values of a channel, or the likely classes."""
+    flat = points.reshape(-1, points.shape[-1]).cpu().numpy()
+    ask = class_labels if channel == CLASS else partial(channel_values, name=channel)
+    values = ask(model, flat)
+    kind = np.int32 if channel == CLASS else np.float32
+    return values.astype(kind).reshape(*points.shape[:-1], *values.shape[1:])
+
+
+def _channel_grid(
+    model: OccupancyMap, first: Tensor, last: Tensor, resolution: float, channel: str
+) -> np.ndarray:
+    """Values of a channel at all points of a `grid`, which must fit in memory."""
+    axes = grid_axes(first, last, resolution)
+    example = cell_values(model, torch.stack([axis[:1] for axis in axes], dim=1), channel)
+    cells = math.prod(len(axis) for axis in axes)
+    what = f"a channel of {cells / 1e6:.3g} million cells"
+    check_memory(what, resolution, float(example.nbytes) * cells, power=len(axes))
+    slabs = axes[0].split(max(1, BLOCK_POINTS * len(axes[0]) // max(1, cells)))
+    points = (torch.stack(torch.meshgrid(s, *axes[1:], indexing="ij"), -1) for s in slabs)
+    return np.concatenate([cell_values(model, part, channel) for part in points])
+
+
 @torch.no_grad()
 def _save_sparse(
     model: OccupancyMap,
@@ -141,11 +180,23 @@ def _save_sparse(
     resolution: float,
     first: Tensor,
     last: Tensor,
+    channel: str | None,
 ) -> int:
     """Write the cells of all blocks near clusters; returns how many."""
     lattice, places = _blocks_of_cells(model, first, last, resolution)
     axes = torch.cartesian_prod(*[torch.arange(BLOCK_CELLS)] * 3)
     shape = (len(places), *[BLOCK_CELLS] * 3)
+
+    def blocks() -> Iterator[Tensor]:
+        for some in places.split(BLOCK_POINTS // len(axes)):
+            yield first + resolution * (some[:, None] + axes).double()
+
+    def probability(points: Tensor) -> np.ndarray:
+        return model(points.to(model.origin.device)).float().cpu().numpy()
+
+    answers: dict[str, Callable[[Tensor], np.ndarray]] = {"probability": probability}
+    if channel is not None:
+        answers[array_name(channel)] = partial(cell_values, model, channel=channel)
     small = {
         "blocks": places.numpy(),
         "lower": (first - 0.5 * resolution).numpy(),
@@ -153,19 +204,20 @@ def _save_sparse(
         "cells": lattice.cells,
     }
     with (
-        replaced_file(path) as partial,
-        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as file,
+        replaced_file(path) as unfinished,
+        zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED) as file,
     ):
         for name, array in small.items():
             with file.open(f"{name}.npy", "w") as member:
                 np.lib.format.write_array(member, np.asanyarray(array))
-        with file.open("probability.npy", "w", force_zip64=True) as member:
-            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(member, header)
-            for some in places.split(BLOCK_POINTS // len(axes)):
-                points = first + resolution * (some[:, None] + axes).double()
-                probability = model(points.to(model.origin.device)).float().cpu().numpy()
-                member.write(probability.astype("<f4").tobytes())
+        for name, ask in answers.items():
+            example = ask(first[None])
+            descr = "<" + example.dtype.str[1:]
+            header = {"descr": descr, "fortran_order": False, "shape": shape + example.shape[1:]}
+            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, header)
+                for points in blocks():
+                    member.write(ask(points).astype(descr).tobytes())
     return math.prod(shape)
 
 

@@ -53,6 +53,15 @@ class GroundGrid(NamedTuple):
         values = np.round(100 * probability)
         return np.where(np.isnan(self.log_odds.T), -1, values).astype(np.int8)
 
+    def shades(self) -> np.ndarray:
+        """(ny, nx, 4) uint8 colors: darker is more occupied, unknown cells are transparent."""
+        known = ~np.isnan(self.log_odds.T)
+        colors = np.zeros((*known.shape, 4), np.uint8)
+        probability = 1 / (1 + np.exp(-self.log_odds.T[known]))
+        colors[known, :3] = np.round(255 * (1 - probability))[:, None]
+        colors[known, 3] = 255
+        return colors
+
 
 @reads_copy
 def save_nav2(

@@ -156,9 +156,14 @@ def write_npz(
     Raises:
         FileNotFoundError: the folder does not exist.
     """
-    named = {n if n in _CHANNELS else _PREFIX + n: v for n, v in (channels or {}).items()}
+    named = {array_name(name): values for name, values in (channels or {}).items()}
     with replaced_file(path) as partial, open(partial, "wb") as file:
         np.savez(file, allow_pickle=False, **arrays, **named)
+
+
+def array_name(channel: str) -> str:
+    """Name of the array of a channel."""
+    return channel if channel in _CHANNELS else _PREFIX + channel
 
 
 def _points_of(archive: zipfile.ZipFile) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 MAGIC = b"LARDPACK"
+CHANNELS_MAGIC = b"LARDCHAN"  # of the block of channels before the packets, see `packed_blocks`
 VERSION = 1
 SUFFIX = ".lhm"
 PRECISIONS = range(1, 17)
@@ -75,7 +76,7 @@ def encode(packed: Packed, number: int = 0, base: Packed | None = None) -> bytes
     values = table[rows]
     values[rows < both] -= before[rows[rows < both]]
     gaps = np.diff(rows, prepend=np.int32(-1))
-    body = zlib.compress(_to_planes(np.column_stack([gaps, values])), LEVEL)
+    body = zlib.compress(to_planes(np.column_stack([gaps, values])), LEVEL)
     lead = (MAGIC, VERSION, len(packed.origin), packed.precision, int(base is None))
     sizes = (len(body), number, packed.num_neighbors, len(table), len(rows))
     checks = (_checksum(before), _checksum(table))
@@ -109,7 +110,9 @@ def decode(packet: bytes, base: tuple[int, Packed] | None = None) -> tuple[int, 
     origin = np.frombuffer(packet[HEADER.size : body], "<f8").astype(np.float64)
     if not np.isfinite([*origin, scale, floor]).all() or min(scale, floor) <= 0 or neighbors < 1:
         raise ValueError("origin and settings of the packet must be finite, settings > 0")
-    columns = _from_planes(packet[body:], num_rows, 1 + num_columns(dim))
+    columns, behind = from_planes(packet[body:], num_rows, 1 + num_columns(dim))
+    if behind:
+        raise ValueError(f"packet must hold {num_rows} rows, {length} bytes; it holds more")
     before = np.zeros((0, num_columns(dim)), np.int32)
     if not is_whole:
         before = _base_table(number, base, (origin.tolist(), precision, neighbors, scale, floor))
@@ -176,7 +179,7 @@ def _checksum(table: np.ndarray) -> int:
     return zlib.crc32(table.astype("<i4").tobytes())
 
 
-def _to_planes(columns: np.ndarray) -> bytes:
+def to_planes(columns: np.ndarray) -> bytes:
     """(R, C) int32 -> C medians, and for each column its lowest bytes, its second bytes, and so on.
 
     Columns are relative to their medians and the sign is moved to the lowest bit, so that the upper
@@ -189,21 +192,22 @@ def _to_planes(columns: np.ndarray) -> bytes:
     return middle.astype("<i4").tobytes() + parts.transpose(0, 2, 1).tobytes()
 
 
-def _from_planes(body: bytes, num_rows: int, width: int) -> np.ndarray:
-    """The reverse of `_to_planes`, from compressed bytes."""
+def from_planes(body: bytes, num_rows: int, width: int) -> tuple[np.ndarray, bytes]:
+    """The reverse of `to_planes`, from compressed bytes; and the bytes that follow."""
     size = PLANES * (1 + num_rows) * width
     inflate = zlib.decompressobj()
     try:
         content = inflate.decompress(body, size + 1)
     except zlib.error as error:
         raise ValueError(f"rows of the packet must be compressed by zlib; {error}") from error
-    if len(content) != size or not inflate.eof or inflate.unused_data:
+    if len(content) != size or not inflate.eof:
         raise ValueError(f"packet must hold {num_rows} rows, {size} bytes; it does not")
     middle = np.frombuffer(content, "<i4", width).astype(np.int32)
     planes = np.frombuffer(content, np.uint8, offset=PLANES * width)
     parts = planes.reshape(width, PLANES, num_rows)
     folded = np.ascontiguousarray(parts.transpose(2, 0, 1)).view("<u4")[..., 0].astype(np.uint32)
-    return middle + ((folded >> 1).astype(np.int32) ^ -(folded & 1).astype(np.int32))
+    table = middle + ((folded >> 1).astype(np.int32) ^ -(folded & 1).astype(np.int32))
+    return table, inflate.unused_data
 
 
 def packet_path(folder: Path, number: int) -> Path:
@@ -224,7 +228,20 @@ def is_packed(path: str | os.PathLike[str]) -> bool:
     if not path.is_file():
         return False
     with open(path, "rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
+        return file.read(len(MAGIC)) in (MAGIC, CHANNELS_MAGIC)
+
+
+def block_size(content: bytes) -> int:
+    """Bytes of the block of channels that a file begins with; 0 if there is none.
+
+    Raises:
+        ValueError: the block is cut short.
+    """
+    if content[: len(CHANNELS_MAGIC)] != CHANNELS_MAGIC:
+        return 0
+    if len(content) < 24:
+        raise ValueError("the block of channels is cut short")
+    return 24 + sum(struct.unpack("<II", content[16:24]))
 
 
 def read_packets(path: str | os.PathLike[str]) -> Iterator[bytes]:
@@ -237,7 +254,8 @@ def read_packets(path: str | os.PathLike[str]) -> Iterator[bytes]:
     if path.is_dir():
         yield from (file.read_bytes() for file in packet_files(path))
         return
-    content, start = path.read_bytes(), 0
+    content = path.read_bytes()
+    start = block_size(content)
     while start < len(content):
         size = _packet_size(content[start : start + HEADER.size])
         if start + size > len(content):

@@ -44,7 +44,7 @@ from lardhm_torch.io.kitti import read_kitti
 from lardhm_torch.io.las import las_pieces, read_las
 from lardhm_torch.io.moving_sensor import seen_from_track
 from lardhm_torch.io.notes import ScanReport, check_notes, no_ray_left
-from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points, write_npz
+from lardhm_torch.io.numpy_files import npz_pieces, read_npy, read_npz, read_npz_points
 from lardhm_torch.io.origins import note_not_finite, scans_from, unused_origin, with_origins
 from lardhm_torch.io.paths import expand_paths, naming_errors
 from lardhm_torch.io.pcd import read_pcd
@@ -52,6 +52,7 @@ from lardhm_torch.io.ply import ply_pieces, read_ply
 from lardhm_torch.io.ptx import read_ptx
 from lardhm_torch.io.readout import Readout, without_zeros
 from lardhm_torch.io.rgbd import Camera, is_rgbd_folder, read_rgbd
+from lardhm_torch.io.scan_writers import save_scans as save_scans
 from lardhm_torch.io.text import read_text
 from lardhm_torch.scans import Scans, concatenate_scans
 
@@ -297,32 +298,6 @@ def _pieces(file: Path, reading: Reading, max_rays: int | None) -> Iterator[Read
                 return
             readout = _placed(readout, file, reading)
         yield readout
-
-
-def save_scans(scans: Scans, path: PathLike) -> None:
-    """Write scans as ``.npz``, atomically.
-
-    Args:
-        scans: range scans, world frame.
-        path: file that ends in .npz; an existing file is replaced.
-
-    Raises:
-        ValueError: path does not end in .npz.
-        FileNotFoundError: the folder of path does not exist.
-    """
-    target = Path(path)
-    if target.suffix.lower() != ".npz":
-        raise ValueError(f"path must end in .npz, the format scans are saved in; got {target}")
-    columns = {
-        "points": scans.ends,
-        "scan_id": scans.scan_id,
-        "origins": scans.origins,
-        "is_return": scans.is_return,
-        "target_index": scans.target_index,
-    }
-    arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
-    channels = {name: value.cpu().numpy() for name, value in scans.channels.items()}
-    write_npz(target, arrays, channels)
 
 
 def load_points(path: PathLike) -> Tensor:

@@ -120,9 +120,19 @@ def conformed(sums: Tensor, before: Layout, after: Layout) -> Tensor:
         result[:, : dim + 1] = sums[:, : dim + 1]
     new = rows_of(after, dim)
     for name, rows in rows_of(before, dim).items():
-        width = rows.stop - rows.start  # joint layouts append classes: theirs come first
-        result[:, new[name].start : new[name].start + width] = sums[:, rows]
+        if name == CLASS:
+            result[:, new[name]] = conformed_classes(sums[:, rows].mT, before, after).mT
+        else:
+            result[:, new[name]] = sums[:, rows]
     return result
+
+
+def conformed_classes(values: Tensor, before: Layout, after: Layout) -> Tensor:
+    """(..., K) values of the classes of a layout -> (..., L) of those of another, added ones are 0."""
+    known, wanted = before.get(CLASS, []), after.get(CLASS, [])
+    columns = column_of_class(wanted, values.device)[known]
+    result = values.new_zeros(*values.shape[:-1], len(wanted))
+    return result.index_copy(-1, columns, values)
 
 
 def sum_channels(hits: Hits, layout: Layout, owners: Tensor, num_clusters: int) -> Tensor:
@@ -212,15 +222,17 @@ def with_layout(
     """
     if is_trained is None:
         is_trained = state.class_weights.shape[1] > 0
-    classes = len(after.get(CLASS, ())) if is_trained else 0
-    missing = classes - state.class_weights.shape[1]
-    if before == after and not missing:
+    weights = state.class_weights
+    if before == after and (weights.shape[1] > 0) == is_trained:
         return state
-    return replace(
-        state,
-        channel_sums=conformed(state.channel_sums, before, after),
-        class_weights=torch.nn.functional.pad(state.class_weights, (0, missing)),
-    )
+    if not is_trained or CLASS not in after:
+        weights = weights[:, :0]
+    elif weights.shape[1] == 0:
+        weights = weights.new_zeros(len(state), len(after[CLASS]))
+    else:
+        weights = conformed_classes(weights, before, after)
+    sums = conformed(state.channel_sums, before, after)
+    return replace(state, channel_sums=sums, class_weights=weights)
 
 
 def with_hits(state: MapState, layout: Layout, hits: Hits) -> MapState:
@@ -255,8 +267,10 @@ def fitted(
         return state, {}
     device = origin.device
     points, labels = as_tensor(points, "points", device), as_tensor(labels, "labels", device)
-    labels = torch.where(inliers(points), labels, 0 * labels)
     hits = hits_with_channels(points, labels, channels)
+    kept = inliers(hits.points, among=points)
+    if not bool(kept.all()):
+        hits = Hits(hits.points[kept], select_channels(hits.channels, kept))
     hits = hits._replace(points=to_map_frame(hits.points, origin, state.means.dtype))
     layout = layout_of(hits.channels)
     return with_hits(with_layout(state, {}, layout), layout, hits), layout

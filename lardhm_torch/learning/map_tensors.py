@@ -68,6 +68,7 @@ class MapTensors(nn.Module):
         self.class_scale = 1.0  # of the class log-odds; see `LardHilbertMap.calibrate_classes`
         self.lock = MapLock()
         self._index = torch.empty(0, dtype=torch.uint8)
+        self._regressions: dict[str, Any] = {}  # of the channels; see `channel_queries`
         self._spare_storages: dict[str, tuple[int, int]] = {}  # of storages with spare capacity
         self._register_hooks()
 

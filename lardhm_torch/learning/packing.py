@@ -17,7 +17,13 @@ import torch
 
 from lardhm_torch.io import map_files, packed_files
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.io.packed_blocks import decode_block, encode_block
 from lardhm_torch.io.packed_files import Packed
+from lardhm_torch.learning.packed_channels import (
+    check_finite,
+    rounded_channels,
+    with_packed_channels,
+)
 from lardhm_torch.learning.parameters import MapParameters, read_state
 
 PRECISION = 6  # fractional bits: changes scores by less than 0.0005 and probabilities by about 0.01
@@ -144,7 +150,12 @@ def _covariances(raw: np.ndarray) -> np.ndarray:
 
 def save_packed(model: MapParameters, path: str | os.PathLike[str], precision: int) -> None:
     """Write a map as one packet that holds it whole, see `LardHilbertMap.pack`."""
-    content = packed_files.encode(rounded(model, precision))
+    packed = rounded(model, precision)
+    content = packed_files.encode(packed)
+    if model.channel_layout:
+        check_finite(model)
+        channels = rounded_channels(model, state_dict_of(packed), 1 << precision)
+        content = encode_block(*channels) + content
     with replaced_file(path) as partial:
         partial.write_bytes(content)
 
@@ -157,5 +168,21 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: the file is not a map file, or damaged.
     """
     if packed_files.is_packed(path):
-        return state_dict_of(packed_files.load_packed(path)[1])
+        return _load_packed(path)
     return map_files.load_state(path)
+
+
+def _load_packed(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """State dict of a packed map with its channels."""
+    packed = packed_files.load_packed(path)[1]
+    state = state_dict_of(packed)
+    if os.path.isdir(path):
+        return state
+    try:
+        with open(path, "rb") as file:
+            block = decode_block(file.read())
+        if block is not None:
+            state = with_packed_channels(state, *block, 1 << packed.precision)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{os.fspath(path)} must be a packed map, whole; {error}") from error
+    return state

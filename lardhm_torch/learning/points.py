@@ -83,7 +83,7 @@ def _drop_outliers(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     return points, labels
 
 
-def inliers(points: Tensor) -> Tensor:
+def inliers(points: Tensor, among: Tensor | None = None) -> Tensor:
     """(N,) mask that is False for outliers, which would degrade the Morton order of all other points.
 
     A point is an outlier if, along any axis, it is farther from the median than `OUTLIER_FACTOR`
@@ -91,8 +91,12 @@ def inliers(points: Tensor) -> Tensor:
 
     Args:
         points: (N, D) positions [m], finite.
+        among: (P, D) all positions, of which the points are some; None: the points.
     """
-    subset = points[:: max(1, len(points) // OUTLIER_SAMPLE)].double()
+    among = points if among is None else among
+    if len(points) == 0:
+        return torch.ones(0, dtype=torch.bool, device=points.device)
+    subset = among[:: max(1, len(among) // OUTLIER_SAMPLE)].double()
     low, middle, high = subset.quantile(subset.new_tensor([0.01, 0.5, 0.99]), dim=0)
     limit = OUTLIER_FACTOR * (high - low).max()
     if not bool(limit > 0):

@@ -38,8 +38,8 @@ def make_room(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) ->
         name: tensor.shape if name in PER_MAP else (num_clusters, *tensor.shape[1:])
         for name, tensor in own.items()
     }
-    _spread_sums(state, prefix, num_clusters)
-    layout, own_shapes = _channel_shapes(state, prefix, model.dim)
+    spread_sums(state, prefix, num_clusters)
+    layout, own_shapes = channel_shapes(state, prefix, model.dim)
     shapes.update({name: (num_clusters, *shape) for name, shape in own_shapes.items()})
     for name, shape in shapes.items():
         if state[prefix + name].shape != torch.Size(shape):
@@ -47,13 +47,13 @@ def make_room(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) ->
                 f"{prefix + name} must be {tuple(shape)} in a map of {num_clusters} clusters; "
                 f"got {tuple(state[prefix + name].shape)}"
             )
-    check_values({name: state[prefix + name] for name in own})
+    check_values({name: state[prefix + name] for name in (*own, *own_shapes)})
     resize(model, num_clusters)
     model.class_scale = _class_scale(state, prefix)
     set_channels(model, layout, has_class_weights="class_weights" in own_shapes)
 
 
-def _channel_shapes(
+def channel_shapes(
     state: dict[str, Any], prefix: str, dim: int
 ) -> tuple[Layout, dict[str, tuple[int, ...]]]:
     """The layout of the channels, and the shape of a row of each of their tensors."""
@@ -78,7 +78,7 @@ def occupied_sums(state: dict[str, Any]) -> dict[str, Any]:
     return {**state, "channel_sums": state["channel_sums"][state["is_occupied"]]}
 
 
-def _spread_sums(state: dict[str, Any], prefix: str, num_clusters: int) -> None:
+def spread_sums(state: dict[str, Any], prefix: str, num_clusters: int) -> None:
     """Undo `occupied_sums` in the state dict of a file."""
     sums, rows = state.get(prefix + "channel_sums"), state[prefix + "is_occupied"]
     if not isinstance(sums, Tensor) or sums.ndim != 3 or rows.dtype != torch.bool:

@@ -140,6 +140,28 @@ def raycast(
     return torch.ops.lardhm.raycast(origins, directions, *march, *parameters, *kernel, index)
 
 
+def expected_ranges(
+    rays: tuple[Tensor, Tensor],
+    march: tuple[float, float, float, float, float],
+    parameters: tuple[Tensor, Tensor, Tensor],
+    kernel: Kernel,
+    index: Tensor,
+) -> Tensor:
+    """As `collision.expected_range` of a point, for a map that `supports` says yes to.
+
+    Args:
+        rays: (R, D) origins in the map's frame and (R, D) directions of length 1, float64 [m].
+        march: step, largest range and length of the hazard [m]; log-odds that may count as 0 where
+            they are not exceeded, and probability below which nothing is reached.
+        parameters: centers, raw factors, weights of the map.
+        kernel: its settings.
+        index: of the centers.
+    """
+    origins, directions = rays
+    given = (*march, *parameters, *kernel, index)
+    return torch.ops.lardhm.expected_ranges(origins, directions, *given)
+
+
 def nearest_features(
     points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -269,6 +291,7 @@ def _register() -> None:
     def _(axes: Tensor, shape: list[int], *_: Any) -> Tensor:
         return axes.new_empty(shape)
 
+    @library.register_fake("lardhm::expected_ranges")
     @library.register_fake("lardhm::raycast")
     def _(origins: Tensor, *_: Any) -> Tensor:
         return origins.new_empty(origins.shape[0])

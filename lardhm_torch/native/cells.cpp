@@ -145,7 +145,7 @@ Tensor unmarked_cells(const Tensor& given_points, const Tensor& given_cells,
   check(points.dim() == 2 && points.size(1) == ways.size(1) &&
             points.scalar_type() == ScalarType::Long,
         "points must be (N, D) numbers of cells, int64");
-  const Tensor unmarked = torch::stable::new_empty(points, {points.size(0)}, ScalarType::Bool);
+  const Tensor unmarked = new_empty(points, {points.size(0)}, ScalarType::Bool);
   const Rays rays{in<int64_t>(cells), in<int64_t>(steps), in<float>(inside),
                   in<float>(ways), ways.size(0), cells.size(0) == 1};
   Table table;
@@ -163,14 +163,13 @@ Tensor unmarked_cells(const Tensor& given_points, const Tensor& given_cells,
 }
 
 }  // namespace
+
+std::vector<Operator> cells_operators() {
+  return {
+      {"unmarked_cells(Tensor points, Tensor cells, Tensor inside, Tensor ways, Tensor steps) -> "
+       "Tensor",
+       &boxed<unmarked_cells>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "unmarked_cells(Tensor points, Tensor cells, Tensor inside, Tensor ways, Tensor steps) -> "
-      "Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("unmarked_cells", TORCH_BOX(&lardhm::unmarked_cells));
-}

@@ -23,13 +23,24 @@ FLAGS = (
 )  # fmt: skip
 ARM = platform.machine() in ("aarch64", "arm64")
 FOR_THIS_PROCESSOR = "-mcpu=native" if ARM else "-march=native"
-# Sources that are compiled together, the longest job first. Torch's headers take a second a unit: the
-# last two do without.
+# Sources that are compiled together, the longest job first. The standard library's headers take a second
+# a unit, torch's, which only the last includes, two more.
 UNITS = (
     ("query", "kmeans", "gradients", "descent", "mixture", "tuning"),
-    ("raycast", "update", "pooling", "evidence", "kept", "cells", "marching", "ridge", "threads"),
+    (
+        "raycast",
+        "expected_range",
+        "update",
+        "pooling",
+        "evidence",
+        "kept",
+        "cells",
+        "marching",
+        "ridge",
+    ),
     ("search", "index"),
     ("kth_distance", "parameters", "sorting"),
+    ("bindings", "threads"),
 )
 LONGEST = 1800  # [s] for one unit, on a slow and busy machine
 COMPILERS = ("c++", "g++", "clang++")

@@ -6,7 +6,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <tuple>
 #include <vector>
 
 #include "tensors.h"
@@ -116,13 +115,13 @@ void descend(const Rates& rates, int64_t step, int64_t rows, int64_t count, T* _
   }
 }
 
-using State = std::tuple<Tensor, Tensor, Tensor>;
+using State = Tensors<3>;
 
 template <class T>
 void run_batches(const Rows<T>& rows, int64_t n, int64_t count, const State& state,
                  const Rates& rates) {
-  T *weights = out<T>(std::get<0>(state)), *mean = out<T>(std::get<1>(state));
-  T* square = out<T>(std::get<2>(state));
+  T *weights = out<T>(state[0]), *mean = out<T>(state[1]);
+  T* square = out<T>(state[2]);
   std::vector<T> slope(count);
   int64_t step = rates.first_step;
   for (int64_t begin = 0; begin < n; begin += rates.batch_size, ++step) {
@@ -135,12 +134,12 @@ void run_batches(const Rows<T>& rows, int64_t n, int64_t count, const State& sta
 void check_descent(const Tensor& indices, const Tensor& values, const Tensor& labels,
                    const Tensor& factors, const State& state) {
   const auto dtype = values.scalar_type();
-  const int64_t n = values.size(0), count = std::get<0>(state).numel();
+  const int64_t n = values.size(0), count = state[0].numel();
   bool fits = indices.dim() == 2 && values.dim() == 2 && indices.size(0) == n &&
               values.size(1) == indices.size(1) && labels.numel() == n && factors.numel() == n &&
               labels.scalar_type() == dtype && factors.scalar_type() == dtype &&
               indices.scalar_type() == ScalarType::Int;
-  for (const Tensor* t : {&std::get<0>(state), &std::get<1>(state), &std::get<2>(state)})
+  for (const Tensor* t : {&state[0], &state[1], &state[2]})
     fits = fits && t->numel() == count && t->scalar_type() == dtype;
   check(fits, "features, labels, factors and state must agree in size and dtype");
   const int32_t* index = in<int32_t>(indices);
@@ -176,16 +175,15 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
 }
 
 }  // namespace
+
+std::vector<Operator> descent_operators() {
+  return {
+      {"descent(Tensor indices, Tensor values, Tensor labels, Tensor factors, Tensor weights, "
+       "Tensor mean, Tensor square, int num_points, int batch_size, int first_step, "
+       "int total_steps, float learning_rate, bool decay, bool preconditioner, float l1, float l2) "
+       "-> (Tensor, Tensor, Tensor)",
+       &boxed<descent>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "descent(Tensor indices, Tensor values, Tensor labels, Tensor factors, Tensor weights, "
-      "Tensor mean, Tensor square, int num_points, int batch_size, int first_step, "
-      "int total_steps, float learning_rate, bool decay, bool preconditioner, float l1, float l2) "
-      "-> (Tensor, Tensor, Tensor)");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("descent", TORCH_BOX(&lardhm::descent));
-}

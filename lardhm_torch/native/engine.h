@@ -27,16 +27,17 @@ constexpr double kRegionPoints = 3000, kGroupPoints = 256, kSparse = 25;
 
 // How many sorted points share a list of blocks, a list of candidates, a register. The fewer points
 // there are a center, the more centers lie between neighbors: where they are very sparse, a point
-// by itself has the shortest list.
+// by itself has the shortest list, unless at least some `together` are neighbors anyway.
 struct Sharing {
   int64_t region, group, packet;
 
-  Sharing(int64_t points, int64_t centers, int64_t lanes) {
+  Sharing(int64_t points, int64_t centers, int64_t lanes, int64_t together = 1) {
     const double sparsity = std::max(1.0, double(centers) / double(std::max<int64_t>(points, 1)));
     region = std::max<int64_t>(1, std::min(kMostPoints, int64_t(kRegionPoints / sparsity)));
     group = std::max<int64_t>(lanes, int64_t(kGroupPoints / sparsity));
     packet = lanes;
-    if (sparsity > kSparse) group = packet = 1;
+    if (sparsity > kSparse) group = packet = std::min(lanes, together);
+    region = std::max(region, packet);
   }
 };
 
@@ -87,6 +88,7 @@ struct Engine {
   Index index;
   const T* points;
   const T* slack = nullptr;  // [m] by point: centers this much farther than the k-th are shown, too
+  int64_t together = 1;      // so many points lie side by side
   Parameters<T, D>& parameters;
   const T* positions;
   int k;
@@ -238,7 +240,7 @@ struct Engine {
   void visit(int64_t begin, int64_t end, Scratch<T, D>& s, Visitor<T, D>& visitor) const {
     const int64_t n = sort_points(begin, end, s, visitor);
     s.make_room();
-    s.sharing = Sharing(n, index.header.count, W);
+    s.sharing = Sharing(n, index.header.count, W, together);
     for (int64_t i = 0, stop; i < n; i = stop) {
       stop = cut(s.sorter.items, n, i, std::min(n, i + s.sharing.region));
       gather(begin, i, stop, s);

@@ -93,7 +93,7 @@ Tensor keep_points(const Tensor& given_points, const Tensor& given_owners, int64
   check(points.dim() == 2 && owners.numel() == points.size(0) &&
             owners.scalar_type() == ScalarType::Int && num_clusters >= 0 && size > 0,
         "owners must be (N,) int32, one per point, and size > 0");
-  const Tensor kept = torch::stable::new_empty(points, {num_clusters, size, points.size(1)});
+  const Tensor kept = new_empty(points, {num_clusters, size, points.size(1)});
   dispatch(points, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -112,12 +112,12 @@ Tensor keep_points(const Tensor& given_points, const Tensor& given_owners, int64
 }
 
 }  // namespace
+
+std::vector<Operator> evidence_operators() {
+  return {
+      {"keep_points(Tensor points, Tensor owners, int num_clusters, int size) -> Tensor",
+       &boxed<keep_points>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def("keep_points(Tensor points, Tensor owners, int num_clusters, int size) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("keep_points", TORCH_BOX(&lardhm::keep_points));
-}

@@ -10,7 +10,6 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <tuple>
 #include <type_traits>
 #include <vector>
 
@@ -296,16 +295,16 @@ Tensor face_tree(const Tensor& given_centers, const Tensor& given_axes, const Te
     const auto faces = arrays_of<dim()>(centers, axes, half, thickness);
     const TreeBuilder<dim()> builder(faces, centers.size(0));
     const Tensor bytes =
-        torch::stable::new_empty(centers, {builder.header.bytes}, ScalarType::Byte);
+        new_empty(centers, {builder.header.bytes}, ScalarType::Byte);
     builder.write(out<char>(bytes));
     return bytes;
   });
 }
 
-std::tuple<Tensor, Tensor, Tensor> nearest_face(
-    const Tensor& given_points, const Tensor& given_tree, const Tensor& given_centers,
-    const Tensor& given_axes, const Tensor& given_half, const Tensor& given_thickness,
-    double max_distance, bool gradient) {
+Tensors<3> nearest_face(const Tensor& given_points, const Tensor& given_tree,
+                        const Tensor& given_centers, const Tensor& given_axes,
+                        const Tensor& given_half, const Tensor& given_thickness,
+                        double max_distance, bool gradient) {
   const Tensor points = tidy(given_points), tree = tidy(given_tree);
   const Tensor centers = tidy(given_centers), axes = tidy(given_axes), half = tidy(given_half);
   const Tensor thickness = tidy(given_thickness);
@@ -320,9 +319,9 @@ std::tuple<Tensor, Tensor, Tensor> nearest_face(
             header.fan == kFan && header.faces == centers.size(0),
         "tree must be made by face_tree of these faces");
   check(max_distance >= 0, "max_distance must be 0 or more");
-  const Tensor values = torch::stable::new_empty(points, {n});
-  const Tensor slopes = torch::stable::new_empty(points, {gradient ? n : 0, dim});
-  const Tensor nearest = torch::stable::new_empty(points, {n}, ScalarType::Long);
+  const Tensor values = new_empty(points, {n});
+  const Tensor slopes = new_empty(points, {gradient ? n : 0, dim});
+  const Tensor nearest = new_empty(points, {n}, ScalarType::Long);
   by_dimension(dim, [&](auto d) {
     const auto faces = arrays_of<d()>(centers, axes, half, thickness);
     const Tree<d()> search(in<char>(tree));
@@ -338,16 +337,15 @@ std::tuple<Tensor, Tensor, Tensor> nearest_face(
 }
 
 }  // namespace
+
+std::vector<Operator> faces_operators() {
+  return {
+      {"face_tree(Tensor centers, Tensor axes, Tensor half, Tensor thickness) -> Tensor",
+       &boxed<face_tree>},
+      {"nearest_face(Tensor points, Tensor tree, Tensor centers, Tensor axes, Tensor half, "
+       "Tensor thickness, float max_distance, bool gradient) -> (Tensor, Tensor, Tensor)",
+       &boxed<nearest_face>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def("face_tree(Tensor centers, Tensor axes, Tensor half, Tensor thickness) -> Tensor");
-  m.def(
-      "nearest_face(Tensor points, Tensor tree, Tensor centers, Tensor axes, Tensor half, "
-      "Tensor thickness, float max_distance, bool gradient) -> (Tensor, Tensor, Tensor)");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("face_tree", TORCH_BOX(&lardhm::face_tree));
-  m.impl("nearest_face", TORCH_BOX(&lardhm::nearest_face));
-}

@@ -3,7 +3,6 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <tuple>
 #include <vector>
 
 #include "kernel.h"
@@ -166,11 +165,10 @@ void scatter_gradients(const Parameters<T, D>& parameters, const T* sums, int64_
   });
 }
 
-using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+using Gradients = Tensors<4>;
 
 Tensor like_or_empty(const Tensor& tensor, bool wanted) {
-  return wanted ? torch::stable::new_zeros(tensor, tensor.sizes())
-                : torch::stable::new_empty(tensor, {0});
+  return wanted ? new_zeros(tensor, tensor.sizes()) : new_empty(tensor, {0});
 }
 
 
@@ -200,14 +198,14 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
       std::vector<BackwardVisitor<T, dim()>> visitors;
       for (int64_t part = 0; part < parts; ++part)
         visitors.emplace_back(parameters, in<T>(grad), probability, k > 1 && k < count, wanted,
-                              (wanted & kPoints) ? out<T>(std::get<0>(result)) : nullptr,
+                              (wanted & kPoints) ? out<T>(result[0]) : nullptr,
                               sums.data() + part * size);
       visit_parts<T, dim()>(in<T>(points), n, parameters, k, each_of<T, dim()>(visitors));
       if (wanted & ~kPoints)
         scatter_gradients<T, dim()>(parameters, sums.data(), parts,
-                                    (wanted & kWeights) ? out<T>(std::get<3>(result)) : nullptr,
-                                    (wanted & kCenters) ? out<T>(std::get<1>(result)) : nullptr,
-                                    (wanted & kScaleTril) ? out<T>(std::get<2>(result)) : nullptr);
+                                    (wanted & kWeights) ? out<T>(result[3]) : nullptr,
+                                    (wanted & kCenters) ? out<T>(result[1]) : nullptr,
+                                    (wanted & kScaleTril) ? out<T>(result[2]) : nullptr);
     });
     return 0;
   });
@@ -215,15 +213,14 @@ Gradients occupancy_backward(const Tensor& given_grad, const Tensor& given_point
 }
 
 }  // namespace
+
+std::vector<Operator> gradients_operators() {
+  return {
+      {"occupancy_backward(Tensor grad, Tensor points, Tensor centers, Tensor raw_scale_tril, "
+       "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
+       "bool probability, int wanted) -> (Tensor, Tensor, Tensor, Tensor)",
+       &boxed<occupancy_backward>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "occupancy_backward(Tensor grad, Tensor points, Tensor centers, Tensor raw_scale_tril, "
-      "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
-      "bool probability, int wanted) -> (Tensor, Tensor, Tensor, Tensor)");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("occupancy_backward", TORCH_BOX(&lardhm::occupancy_backward));
-}

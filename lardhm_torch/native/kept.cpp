@@ -6,7 +6,6 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <tuple>
 #include <vector>
 
 #include "clusters.h"
@@ -64,7 +63,7 @@ int64_t count_kept(const T* points, int64_t size) {
 Tensor kept_counts(const Tensor& given) {
   const Tensor evidence = tidy(given);
   const int64_t count = evidence.size(0), size = evidence.size(1);
-  const Tensor counts = torch::stable::new_empty(evidence, {count}, ScalarType::Long);
+  const Tensor counts = new_empty(evidence, {count}, ScalarType::Long);
   with_evidence(evidence, [&](auto type, auto dim) {
     using T = decltype(type);
     for_rows(count, [&](int64_t row) {
@@ -75,7 +74,7 @@ Tensor kept_counts(const Tensor& given) {
   return counts;
 }
 
-std::tuple<Tensor, Tensor> kept_points(const Tensor& given, const Tensor& given_rows) {
+Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows) {
   const Tensor evidence = tidy(given), rows = tidy(given_rows);
   check(rows.scalar_type() == ScalarType::Long, "rows must be int64");
   const int64_t count = rows.numel(), size = evidence.size(1);
@@ -90,8 +89,8 @@ std::tuple<Tensor, Tensor> kept_points(const Tensor& given, const Tensor& given_
     const T* all = in<T>(evidence);
     for (int64_t i = 0; i < count; ++i)
       first[i + 1] = first[i] + count_kept<T, D>(all + in<int64_t>(rows)[i] * size * D, size);
-    points = torch::stable::new_empty(evidence, {first[count], D});
-    owners = torch::stable::new_empty(evidence, {first[count]}, ScalarType::Long);
+    points = new_empty(evidence, {first[count], D});
+    owners = new_empty(evidence, {first[count]}, ScalarType::Long);
     for_rows(count, [&](int64_t i) {
       const int64_t row = in<int64_t>(rows)[i], kept = first[i + 1] - first[i];
       std::copy_n(all + row * size * D, kept * D, out<T>(points) + first[i] * D);
@@ -108,7 +107,7 @@ Tensor kept_again(const Tensor& given_points, const Tensor& given_owners, const 
   check(owners.scalar_type() == ScalarType::Long && owners.numel() == n &&
             points.scalar_type() == evidence.scalar_type() && points.size(1) == evidence.size(2),
         "points must be (N, D) like the evidence, owners (N,) int64");
-  const Tensor again = torch::stable::new_zeros(evidence, {count}, ScalarType::Long);
+  const Tensor again = new_zeros(evidence, {count}, ScalarType::Long);
   with_evidence(evidence, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -149,30 +148,30 @@ struct KeptMoments {
   }
 };
 
-using Moments = std::tuple<Tensor, Tensor, Tensor>;
+using Moments = Tensors<3>;
 
 Moments kept_moments(const Tensor& given) {
   const Tensor evidence = tidy(given);
   const int64_t count = evidence.size(0), size = evidence.size(1), dim = evidence.size(2);
-  const Moments result{torch::stable::new_empty(evidence, {count}, ScalarType::Long),
-                       torch::stable::new_empty(evidence, {count, dim}),
-                       torch::stable::new_empty(evidence, {count, dim, dim})};
+  const Moments result{new_empty(evidence, {count}, ScalarType::Long),
+                       new_empty(evidence, {count, dim}),
+                       new_empty(evidence, {count, dim, dim})};
   with_evidence(evidence, [&](auto type, auto dimension) {
     using T = decltype(type);
     constexpr int D = dimension();
     for_rows(count, [&](int64_t row) {
       const KeptMoments<T, D> found(in<T>(evidence) + row * size * D, size);
-      out<int64_t>(std::get<0>(result))[row] = int64_t(found.count);
-      for (int d = 0; d < D; ++d) out<T>(std::get<1>(result))[row * D + d] = T(found.mean[d]);
+      out<int64_t>(result[0])[row] = int64_t(found.count);
+      for (int d = 0; d < D; ++d) out<T>(result[1])[row * D + d] = T(found.mean[d]);
       for (int i = 0; i < D * D; ++i)
-        out<T>(std::get<2>(result))[row * D * D + i] = T(found.scatter[i]);
+        out<T>(result[2])[row * D * D + i] = T(found.scatter[i]);
     });
   });
   return result;
 }
 
 // Clusters that follow their kept points: (centers, means, scatters, raw factors).
-std::tuple<Tensor, Tensor, Tensor, Tensor> follow_kept(
+Tensors<4> follow_kept(
     const Tensor& given, const Tensor& given_counts, const Tensor& given_centers,
     const Tensor& given_means, const Tensor& given_scatters, const Tensor& given_raw,
     const Tensor& given_known, double floor) {
@@ -262,24 +261,18 @@ int64_t count_cells(const Tensor& given_points, double edge) {
 }
 
 }  // namespace
+
+std::vector<Operator> kept_operators() {
+  return {
+      {"kept_counts(Tensor evidence) -> Tensor", &boxed<kept_counts>},
+      {"kept_points(Tensor evidence, Tensor rows) -> (Tensor, Tensor)", &boxed<kept_points>},
+      {"kept_again(Tensor points, Tensor owners, Tensor evidence) -> Tensor", &boxed<kept_again>},
+      {"kept_moments(Tensor evidence) -> (Tensor, Tensor, Tensor)", &boxed<kept_moments>},
+      {"follow_kept(Tensor evidence, Tensor counts, Tensor centers, Tensor means, Tensor scatters, "
+       "Tensor raw_scale_tril, Tensor known, float floor) -> (Tensor, Tensor, Tensor, Tensor)",
+       &boxed<follow_kept>},
+      {"count_cells(Tensor points, float edge) -> int", &boxed<count_cells>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def("kept_counts(Tensor evidence) -> Tensor");
-  m.def("kept_points(Tensor evidence, Tensor rows) -> (Tensor, Tensor)");
-  m.def("kept_again(Tensor points, Tensor owners, Tensor evidence) -> Tensor");
-  m.def("kept_moments(Tensor evidence) -> (Tensor, Tensor, Tensor)");
-  m.def(
-      "follow_kept(Tensor evidence, Tensor counts, Tensor centers, Tensor means, Tensor scatters, "
-      "Tensor raw_scale_tril, Tensor known, float floor) -> (Tensor, Tensor, Tensor, Tensor)");
-  m.def("count_cells(Tensor points, float edge) -> int");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("kept_counts", TORCH_BOX(&lardhm::kept_counts));
-  m.impl("kept_points", TORCH_BOX(&lardhm::kept_points));
-  m.impl("kept_again", TORCH_BOX(&lardhm::kept_again));
-  m.impl("kept_moments", TORCH_BOX(&lardhm::kept_moments));
-  m.impl("follow_kept", TORCH_BOX(&lardhm::follow_kept));
-  m.impl("count_cells", TORCH_BOX(&lardhm::count_cells));
-}

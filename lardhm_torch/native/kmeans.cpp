@@ -3,7 +3,6 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <tuple>
 #include <vector>
 
 #include "moments.h"
@@ -60,7 +59,7 @@ MomentParts<D> moments_of(const T* points, int64_t n, const T* centers, const In
   return moments;
 }
 
-using Moments = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+using Moments = Tensors<4>;
 
 Moments assign(const Tensor& given_points, const Tensor& given_centers, const Tensor& given_index,
                bool scatter) {
@@ -69,18 +68,18 @@ Moments assign(const Tensor& given_points, const Tensor& given_centers, const Te
   check_rows("points", points, centers);
   const int64_t count = centers.size(0), dim_size = centers.size(1), n = points.size(0);
   check(count > 0, "centers must hold at least one row");
-  const Moments result{torch::stable::new_empty(points, {n}, ScalarType::Long),
-                       torch::stable::new_zeros(points, {count}),
-                       torch::stable::new_zeros(points, {count, dim_size}),
-                       torch::stable::new_zeros(points, {scatter ? count : 0, dim_size, dim_size})};
+  const Moments result{new_empty(points, {n}, ScalarType::Long),
+                       new_zeros(points, {count}),
+                       new_zeros(points, {count, dim_size}),
+                       new_zeros(points, {scatter ? count : 0, dim_size, dim_size})};
   if (n == 0) return result;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     const CallIndex<T, dim()> call(in<char>(index), index.numel(), in<T>(centers), count);
     const auto moments = moments_of<T, dim()>(in<T>(points), n, in<T>(centers), call.index, scatter,
-                                              out<int64_t>(std::get<0>(result)));
-    moments.write(call.index.order, out<T>(std::get<1>(result)), out<T>(std::get<2>(result)),
-                  scatter ? out<T>(std::get<3>(result)) : nullptr);
+                                              out<int64_t>(result[0]));
+    moments.write(call.index.order, out<T>(result[1]), out<T>(result[2]),
+                  scatter ? out<T>(result[3]) : nullptr);
     return 0;
   });
   return result;
@@ -118,7 +117,7 @@ Tensor kmeans(const Tensor& given_points, const Tensor& given_start, const Tenso
   check_row_numbers(rows, points.size(0));
   check(batch_size >= 1 && restart_every >= 1 && start.size(0) >= 1,
         "batch_size, restart_every and the number of centers must be 1 or more");
-  const Tensor centers = torch::stable::new_empty(start, start.sizes());
+  const Tensor centers = new_empty(start, start.sizes());
   dispatch(start, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -143,7 +142,7 @@ Tensor kmeans(const Tensor& given_points, const Tensor& given_start, const Tenso
 Tensor z_order(const Tensor& given_points) {
   const Tensor points = tidy(given_points);
   const int64_t n = points.size(0);
-  const Tensor order = torch::stable::new_empty(points, {n}, ScalarType::Long);
+  const Tensor order = new_empty(points, {n}, ScalarType::Long);
   dispatch(points, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim(), kBits = 10;
@@ -175,20 +174,17 @@ Tensor z_order(const Tensor& given_points) {
 }
 
 }  // namespace
+
+std::vector<Operator> kmeans_operators() {
+  return {
+      {"assign(Tensor points, Tensor centers, Tensor index, bool scatter) "
+       "-> (Tensor, Tensor, Tensor, Tensor)",
+       &boxed<assign>},
+      {"kmeans(Tensor points, Tensor start, Tensor rows, int batch_size, int restart_every) "
+       "-> Tensor",
+       &boxed<kmeans>},
+      {"z_order(Tensor points) -> Tensor", &boxed<z_order>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "assign(Tensor points, Tensor centers, Tensor index, bool scatter) "
-      "-> (Tensor, Tensor, Tensor, Tensor)");
-  m.def(
-      "kmeans(Tensor points, Tensor start, Tensor rows, int batch_size, int restart_every) "
-      "-> Tensor");
-  m.def("z_order(Tensor points) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("assign", TORCH_BOX(&lardhm::assign));
-  m.impl("kmeans", TORCH_BOX(&lardhm::kmeans));
-  m.impl("z_order", TORCH_BOX(&lardhm::z_order));
-}

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <tuple>
 #include <vector>
 
 #include "tensors.h"
@@ -96,9 +95,8 @@ struct Marcher {
   }
 };
 
-std::tuple<Tensor, Tensor, Tensor> march_blocks(const Tensor& given_values, double level,
-                                                const Tensor& given_cells,
-                                                const Tensor& given_table) {
+Tensors<3> march_blocks(const Tensor& given_values, double level, const Tensor& given_cells,
+                        const Tensor& given_table) {
   const Tensor values = tidy(given_values), cells = tidy(given_cells), table = tidy(given_table);
   check(values.dim() == 4 && values.scalar_type() == ScalarType::Float && values.size(1) > 1 &&
             values.size(1) == values.size(2) && values.size(2) == values.size(3),
@@ -128,9 +126,9 @@ std::tuple<Tensor, Tensor, Tensor> march_blocks(const Tensor& given_values, doub
     first_face[task + 1] = first_face[task] + int64_t(parts[task].faces.size()) / 3;
   }
   check(first[tasks] < (int64_t(1) << 31), "the blocks of one call must have fewer than 2^31 vertices");
-  const Tensor edges = torch::stable::new_empty(values, {first[tasks]}, ScalarType::Long);
-  const Tensor shares = torch::stable::new_empty(values, {first[tasks]});
-  const Tensor faces = torch::stable::new_empty(values, {first_face[tasks], 3}, ScalarType::Int);
+  const Tensor edges = new_empty(values, {first[tasks]}, ScalarType::Long);
+  const Tensor shares = new_empty(values, {first[tasks]});
+  const Tensor faces = new_empty(values, {first_face[tasks], 3}, ScalarType::Int);
   run_tasks(tasks, [&](int64_t task) {
     const Part& part = parts[task];
     std::copy(part.edges.begin(), part.edges.end(), out<int64_t>(edges) + first[task]);
@@ -142,14 +140,13 @@ std::tuple<Tensor, Tensor, Tensor> march_blocks(const Tensor& given_values, doub
 }
 
 }  // namespace
+
+std::vector<Operator> marching_operators() {
+  return {
+      {"march_blocks(Tensor values, float level, Tensor cells, Tensor table) "
+       "-> (Tensor, Tensor, Tensor)",
+       &boxed<march_blocks>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "march_blocks(Tensor values, float level, Tensor cells, Tensor table) "
-      "-> (Tensor, Tensor, Tensor)");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("march_blocks", TORCH_BOX(&lardhm::march_blocks));
-}

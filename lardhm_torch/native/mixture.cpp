@@ -81,11 +81,11 @@ Tensor mixture(const Tensor& given_points, const Tensor& centers, const Tensor& 
             (table.size(2) == 1 || table.size(2) == 1 + centers.size(1)) &&
             table.scalar_type() == centers.scalar_type(),
         "table must be (M, C, 1) or (M, C, 1 + D) for M centers, of their dtype");
-  const Tensor weights = torch::stable::new_zeros(centers, {centers.size(0)});
+  const Tensor weights = new_zeros(centers, {centers.size(0)});
   const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
   k = std::min(k, centers.size(0));
   const int64_t n = points.size(0), columns = table.size(1), width = table.size(2);
-  const Tensor sums = torch::stable::new_zeros(points, {n, columns});
+  const Tensor sums = new_zeros(points, {n, columns});
   if (k == 0 || columns == 0) return sums;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
@@ -105,12 +105,13 @@ Tensor mixture(const Tensor& given_points, const Tensor& centers, const Tensor& 
 }
 
 }  // namespace
-}  // namespace lardhm
 
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "mixture(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor table, int k, "
-      "float covariance_scale, float min_lengthscale, Tensor index, bool sharp) -> Tensor");
+std::vector<Operator> mixture_operators() {
+  return {
+      {"mixture(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor table, int k, "
+       "float covariance_scale, float min_lengthscale, Tensor index, bool sharp) -> Tensor",
+       &boxed<mixture>},
+  };
 }
 
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) { m.impl("mixture", TORCH_BOX(&lardhm::mixture)); }
+}  // namespace lardhm

@@ -5,7 +5,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <tuple>
 
 #include "clusters.h"
 
@@ -40,7 +39,7 @@ struct Pooled {
   }
 };
 
-using Clusters = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Clusters = Tensors<5>;
 
 // (counts, means, scatters, how far the means moved, raw factors) of the clusters of both.
 Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tensor& given_scatters,
@@ -53,11 +52,11 @@ Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tenso
   check_moments(counts, means, scatters, means);
   check_moments(new_counts, new_means, new_scatters, means);
   check_moments(counts, means, raw, means);
-  const Clusters result{torch::stable::new_empty(counts, counts.sizes()),
-                        torch::stable::new_empty(means, means.sizes()),
-                        torch::stable::new_empty(scatters, scatters.sizes()),
-                        torch::stable::new_empty(means, means.sizes()),
-                        torch::stable::new_empty(raw, raw.sizes())};
+  const Clusters result{new_empty(counts, counts.sizes()),
+                        new_empty(means, means.sizes()),
+                        new_empty(scatters, scatters.sizes()),
+                        new_empty(means, means.sizes()),
+                        new_empty(raw, raw.sizes())};
   dispatch(means, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -70,15 +69,15 @@ Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tenso
         const T* before = in<T>(scatters) + m * D * D;
         const Pooled<T, D> pooled(known, in<T>(means) + m * D, before, found,
                                   in<T>(new_means) + m * D, in<T>(new_scatters) + m * D * D);
-        out<int64_t>(std::get<0>(result))[m] = known + found;
+        out<int64_t>(result[0])[m] = known + found;
         for (int d = 0; d < D; ++d) {
-          out<T>(std::get<1>(result))[m * D + d] = T(pooled.mean[d]);
-          out<T>(std::get<3>(result))[m * D + d] = T(pooled.shift[d]);
+          out<T>(result[1])[m * D + d] = T(pooled.mean[d]);
+          out<T>(result[3])[m * D + d] = T(pooled.shift[d]);
         }
         for (int i = 0; i < D * D; ++i)
-          out<T>(std::get<2>(result))[m * D * D + i] = T(pooled.scatter[i]);
+          out<T>(result[2])[m * D * D + i] = T(pooled.scatter[i]);
         if (!pooled.move(before, known, floor, in<T>(raw) + m * D * D,
-                         out<T>(std::get<4>(result)) + m * D * D))
+                         out<T>(result[4]) + m * D * D))
           definite = false;
       }
     });
@@ -89,13 +88,14 @@ Clusters pool(const Tensor& given_counts, const Tensor& given_means, const Tenso
 }
 
 }  // namespace
-}  // namespace lardhm
 
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "pool(Tensor counts, Tensor means, Tensor scatters, Tensor raw_scale_tril, Tensor new_counts, "
-      "Tensor new_means, Tensor new_scatters, float floor) "
-      "-> (Tensor, Tensor, Tensor, Tensor, Tensor)");
+std::vector<Operator> pooling_operators() {
+  return {
+      {"pool(Tensor counts, Tensor means, Tensor scatters, Tensor raw_scale_tril, Tensor new_counts, "
+       "Tensor new_means, Tensor new_scatters, float floor) "
+       "-> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+       &boxed<pool>},
+  };
 }
 
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) { m.impl("pool", TORCH_BOX(&lardhm::pool)); }
+}  // namespace lardhm

@@ -4,7 +4,6 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <tuple>
 #include <vector>
 
 #include "candidates.h"
@@ -103,7 +102,7 @@ Tensor make_index(const Tensor& given_centers, int64_t k) {
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     const int64_t count = centers.size(0);
-    index = torch::stable::new_empty(centers, {index_size<T, dim()>(count)}, ScalarType::Byte);
+    index = new_empty(centers, {index_size<T, dim()>(count)}, ScalarType::Byte);
     write_index<T, dim()>(in<T>(centers), count, out<char>(index));
     return 0;
   });
@@ -128,7 +127,7 @@ Tensor nearest(const Tensor& given_points, const Tensor& given_centers, int64_t 
   check_rows("points", points, centers);
   k = std::min(k, centers.size(0));
   const int64_t n = points.size(0);
-  const Tensor rows = torch::stable::new_empty(points, {n, k}, ScalarType::Long);
+  const Tensor rows = new_empty(points, {n, k}, ScalarType::Long);
   if (k == 0) return rows;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
@@ -160,20 +159,19 @@ std::vector<int32_t> places_of(const Tensor& order, int64_t n) {
 
 // Neighbors and kernel values of all points, row by row or, if `ordered`, those of the points in the
 // order given, each point's own unsorted.
-std::tuple<Tensor, Tensor> features_in_order(const Tensor& given_points, const Tensor& given_order,
-                                             const Tensor& centers, const Tensor& raw,
-                                             const Tensor& index, int64_t k, const Scaling& scaling,
-                                             bool ordered) {
+Tensors<2> features_in_order(const Tensor& given_points, const Tensor& given_order,
+                             const Tensor& centers, const Tensor& raw, const Tensor& index,
+                             int64_t k, const Scaling& scaling, bool ordered) {
   check_k(k);
   const Tensor points = tidy(given_points);
   check_rows("points", points, centers);
-  const Tensor weights = torch::stable::new_zeros(centers, {centers.size(0)});
+  const Tensor weights = new_zeros(centers, {centers.size(0)});
   const MapTensors map(centers, raw, weights, index, scaling.covariance_scale,
                        scaling.min_lengthscale);
   k = std::min(k, centers.size(0));
   const int64_t n = points.size(0);
-  const Tensor rows = torch::stable::new_empty(points, {n, k}, ScalarType::Int);
-  const Tensor values = torch::stable::new_empty(points, {n, k});
+  const Tensor rows = new_empty(points, {n, k}, ScalarType::Int);
+  const Tensor values = new_empty(points, {n, k});
   if (k == 0) return {rows, values};
   std::vector<int32_t> places;
   if (ordered) places = places_of(tidy(given_order), n);
@@ -189,17 +187,16 @@ std::tuple<Tensor, Tensor> features_in_order(const Tensor& given_points, const T
   return {rows, values};
 }
 
-std::tuple<Tensor, Tensor> nearest_features(const Tensor& points, const Tensor& centers,
-                                            const Tensor& raw, const Tensor& index, int64_t k,
-                                            double covariance_scale, double min_lengthscale) {
+Tensors<2> nearest_features(const Tensor& points, const Tensor& centers, const Tensor& raw,
+                            const Tensor& index, int64_t k, double covariance_scale,
+                            double min_lengthscale) {
   const Scaling scaling{covariance_scale, min_lengthscale};
   return features_in_order(points, points, centers, raw, index, k, scaling, false);
 }
 
-std::tuple<Tensor, Tensor> ordered_features(const Tensor& points, const Tensor& order,
-                                            const Tensor& centers, const Tensor& raw,
-                                            const Tensor& index, int64_t k,
-                                            double covariance_scale, double min_lengthscale) {
+Tensors<2> ordered_features(const Tensor& points, const Tensor& order, const Tensor& centers,
+                            const Tensor& raw, const Tensor& index, int64_t k,
+                            double covariance_scale, double min_lengthscale) {
   const Scaling scaling{covariance_scale, min_lengthscale};
   return features_in_order(points, order, centers, raw, index, k, scaling, true);
 }
@@ -224,7 +221,7 @@ Tensor occupancy(const Tensor& given_points, const Tensor& centers, const Tensor
   check_rows("points", points, centers);
   const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
   k = std::min(k, centers.size(0));
-  const Tensor values = torch::stable::new_empty(points, {points.size(0)});
+  const Tensor values = new_empty(points, {points.size(0)});
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     if (k == 0) {
@@ -242,7 +239,7 @@ Tensor occupancy(const Tensor& given_points, const Tensor& centers, const Tensor
 }
 
 // The same for a lattice; `axes` holds the coordinates of all axes after each other.
-Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyArrayRef shape,
+Tensor lattice_occupancy(const Tensor& given_axes, const Sizes& shape,
                          const Tensor& centers, const Tensor& raw, const Tensor& weights, int64_t k,
                          double covariance_scale, double min_lengthscale, const Tensor& index,
                          bool probability) {
@@ -257,8 +254,8 @@ Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderO
         "axes must hold one list of coordinates for each dimension of the map, of its "
         "dtype, and fewer than 2^26 points in a plane");
   k = std::min(k, centers.size(0));
-  const Tensor values = torch::stable::new_zeros(axes, shape);
-  if (total == 0 || k == 0) return probability ? torch::stable::fill_(values, 0.5) : values;
+  const Tensor values = new_zeros(axes, shape);
+  if (total == 0 || k == 0) return probability ? fill(values, 0.5) : values;
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -274,7 +271,7 @@ Tensor lattice_occupancy(const Tensor& given_axes, torch::headeronly::IntHeaderO
 }
 
 // Log-odds at the points of cubes of a lattice, (B, edge, ...) for (B, D) first points.
-Tensor cube_log_odds(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyArrayRef shape,
+Tensor cube_log_odds(const Tensor& given_axes, const Sizes& shape,
                      const Tensor& given_firsts, int64_t edge, const Tensor& centers,
                      const Tensor& raw, const Tensor& weights, int64_t k, double covariance_scale,
                      double min_lengthscale, const Tensor& index) {
@@ -298,8 +295,8 @@ Tensor cube_log_odds(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyA
   std::vector<int64_t> sizes(1, cubes);
   sizes.insert(sizes.end(), dim, edge);
   k = std::min(k, centers.size(0));
-  const Tensor values = torch::stable::new_zeros(
-      axes, torch::headeronly::IntHeaderOnlyArrayRef(sizes.data(), sizes.size()));
+  const Tensor values = new_zeros(
+      axes, sizes);
   if (cubes == 0 || k == 0) return values;
   dispatch(centers, [&](auto type, auto dimension) {
     using T = decltype(type);
@@ -316,36 +313,28 @@ Tensor cube_log_odds(const Tensor& given_axes, torch::headeronly::IntHeaderOnlyA
 }
 
 }  // namespace
+
+std::vector<Operator> query_operators() {
+  return {
+      {"build_index(Tensor centers, int k) -> Tensor", &boxed<make_index>},
+      {"index_matches(Tensor index, Tensor centers, int k) -> bool", &boxed<index_matches>},
+      {"nearest(Tensor points, Tensor centers, int k, Tensor index) -> Tensor", &boxed<nearest>},
+      {"nearest_features(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
+       "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)",
+       &boxed<nearest_features>},
+      {"ordered_features(Tensor points, Tensor order, Tensor centers, Tensor raw_scale_tril, "
+       "Tensor index, int k, float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)",
+       &boxed<ordered_features>},
+      {"occupancy", &boxed<occupancy>},  // operators.py defines it
+      {"lattice_occupancy(Tensor axes, int[] shape, Tensor centers, Tensor raw_scale_tril, "
+       "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
+       "bool probability) -> Tensor",
+       &boxed<lattice_occupancy>},
+      {"cube_log_odds(Tensor axes, int[] shape, Tensor firsts, int edge, Tensor centers, "
+       "Tensor raw_scale_tril, Tensor weights, int k, float covariance_scale, "
+       "float min_lengthscale, Tensor index) -> Tensor",
+       &boxed<cube_log_odds>},
+  };
+}
+
 }  // namespace lardhm
-
-// operators.py defines `occupancy`, before this library is loaded.
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def("build_index(Tensor centers, int k) -> Tensor");
-  m.def("index_matches(Tensor index, Tensor centers, int k) -> bool");
-  m.def("nearest(Tensor points, Tensor centers, int k, Tensor index) -> Tensor");
-  m.def(
-      "nearest_features(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
-      "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
-  m.def(
-      "ordered_features(Tensor points, Tensor order, Tensor centers, Tensor raw_scale_tril, "
-      "Tensor index, int k, float covariance_scale, float min_lengthscale) -> (Tensor, Tensor)");
-  m.def(
-      "lattice_occupancy(Tensor axes, int[] shape, Tensor centers, Tensor raw_scale_tril, "
-      "Tensor weights, int k, float covariance_scale, float min_lengthscale, Tensor index, "
-      "bool probability) -> Tensor");
-  m.def(
-      "cube_log_odds(Tensor axes, int[] shape, Tensor firsts, int edge, Tensor centers, "
-      "Tensor raw_scale_tril, Tensor weights, int k, float covariance_scale, "
-      "float min_lengthscale, Tensor index) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("build_index", TORCH_BOX(&lardhm::make_index));
-  m.impl("index_matches", TORCH_BOX(&lardhm::index_matches));
-  m.impl("nearest", TORCH_BOX(&lardhm::nearest));
-  m.impl("nearest_features", TORCH_BOX(&lardhm::nearest_features));
-  m.impl("ordered_features", TORCH_BOX(&lardhm::ordered_features));
-  m.impl("occupancy", TORCH_BOX(&lardhm::occupancy));
-  m.impl("lattice_occupancy", TORCH_BOX(&lardhm::lattice_occupancy));
-  m.impl("cube_log_odds", TORCH_BOX(&lardhm::cube_log_odds));
-}

@@ -92,9 +92,9 @@ Tensor ridge_positions(const Tensor& given_points, const Tensor& given_strides, 
           "points and strides must be (V, D) float64");
   check(steps >= 2 && steps < 1024, "steps must be 2 to 1023");
   k = std::min(k, centers.size(0));
-  const Tensor positions = torch::stable::new_empty(points, {n});
+  const Tensor positions = new_empty(points, {n});
   if (k == 0)
-    return torch::stable::fill_(positions, std::numeric_limits<double>::quiet_NaN());
+    return fill(positions, std::numeric_limits<double>::quiet_NaN());
   dispatch(centers, [&](auto type, auto dim) {
     using T = decltype(type);
     with_parameters<T, dim()>(map, n * steps, [&](Parameters<T, dim()>& parameters) {
@@ -133,7 +133,7 @@ Tensor mean_with_neighbors(const Tensor& given_values, const Tensor& given_faces
     for (int64_t c = 0; c < width; ++c)
       if (std::isnan(value[i * width + c])) known[i] = 0;
   counts = known;
-  const Tensor sums = torch::stable::new_zeros(values, {n, width});
+  const Tensor sums = new_zeros(values, {n, width});
   double* sum = out<double>(sums);
   const auto add = [&](int64_t to, int64_t from) {
     if (!known[from]) return;
@@ -155,17 +155,15 @@ Tensor mean_with_neighbors(const Tensor& given_values, const Tensor& given_faces
 }
 
 }  // namespace
+
+std::vector<Operator> ridge_operators() {
+  return {
+      {"ridge_positions(Tensor points, Tensor strides, int steps, float fall, Tensor centers, "
+       "Tensor raw_scale_tril, Tensor weights, int k, float covariance_scale, "
+       "float min_lengthscale, Tensor index) -> Tensor",
+       &boxed<ridge_positions>},
+      {"mean_with_neighbors(Tensor values, Tensor faces) -> Tensor", &boxed<mean_with_neighbors>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "ridge_positions(Tensor points, Tensor strides, int steps, float fall, Tensor centers, "
-      "Tensor raw_scale_tril, Tensor weights, int k, float covariance_scale, "
-      "float min_lengthscale, Tensor index) -> Tensor");
-  m.def("mean_with_neighbors(Tensor values, Tensor faces) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("ridge_positions", TORCH_BOX(&lardhm::ridge_positions));
-  m.impl("mean_with_neighbors", TORCH_BOX(&lardhm::mean_with_neighbors));
-}

@@ -207,9 +207,11 @@ template <class T, int D>
 Search<T, D>::~Search() = default;
 
 template <class T, int D>
-void Search<T, D>::visit(const T* points, const T* slack, int64_t n, Visitor<T, D>& visitor) {
+void Search<T, D>::visit(const T* points, const T* slack, int64_t n, Visitor<T, D>& visitor,
+                         int64_t together) {
   Engine<T, D> engine(points, parameters, k);
   engine.slack = slack;
+  engine.together = together;
   if (n) engine.visit(0, n, *scratch, visitor);
 }
 

@@ -60,8 +60,10 @@ class Search {
   ~Search();
 
   // Shows the visitor n points with their k nearest centers and, where slack [m] by point is given,
-  // all that are no more than that much farther than the k-th.
-  void visit(const T* points, const T* slack, int64_t n, Visitor<T, D>& visitor);
+  // all that are no more than that much farther than the k-th. At least `together` of them each are
+  // neighbors.
+  void visit(const T* points, const T* slack, int64_t n, Visitor<T, D>& visitor,
+             int64_t together = 1);
 
  private:
   Parameters<T, D>& parameters;

@@ -2,10 +2,6 @@
 
 #pragma once
 
-#include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-
 #include <cstdint>
 #include <cstring>
 #include <stdexcept>
@@ -13,11 +9,9 @@
 #include <type_traits>
 
 #include "search.h"
+#include "tensor.h"
 
 namespace lardhm {
-
-using torch::headeronly::ScalarType;
-using torch::stable::Tensor;
 
 [[noreturn]] inline void fail(const std::string& message) { throw std::runtime_error(message); }
 
@@ -25,11 +19,11 @@ inline void check(bool holds, const char* rule) {
   if (!holds) fail(rule);
 }
 
-inline Tensor tidy(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
+inline Tensor tidy(const Tensor& tensor) { return contiguous(tensor); }
 
 // A contiguous copy of a float32 or float64 tensor.
 inline Tensor copy_of(const Tensor& tensor) {
-  const Tensor from = tidy(tensor), copy = torch::stable::new_empty(tensor, tensor.sizes());
+  const Tensor from = tidy(tensor), copy = new_empty(tensor, tensor.sizes());
   const int64_t bytes = from.scalar_type() == ScalarType::Double ? 8 : 4;
   std::memcpy(copy.mutable_data_ptr(), from.const_data_ptr(), from.numel() * bytes);
   return copy;

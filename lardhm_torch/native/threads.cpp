@@ -1,4 +1,4 @@
-// The only source that uses torch's thread pool; the others compile faster without its headers.
+// Work shared out to the threads of torch.
 
 #include "threads.h"
 

@@ -6,7 +6,6 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <tuple>
 #include <vector>
 
 #include "kernel.h"
@@ -339,7 +338,7 @@ void run_batches(const Samples<T>& samples, int64_t n, const Table<T>& table, co
   }
 }
 
-using State = std::tuple<Tensor, Tensor, Tensor>;
+using State = Tensors<3>;
 
 void check_state(const Tensor& points, const Tensor& start, std::initializer_list<const Tensor*> like) {
   const int64_t dim = points.size(1);
@@ -395,8 +394,8 @@ State tuning_steps(const Tensor& given_points, const Tensor& given_indices,
   dispatch(points, [&](auto type, auto dim) {
     using T = decltype(type);
     const Samples<T> samples{in<T>(points), in<int32_t>(indices), in<T>(labels), in<T>(factors), k};
-    const Table<T> table{in<T>(start), in<T>(unit), out<T>(std::get<0>(state)),
-                         out<T>(std::get<1>(state)), out<T>(std::get<2>(state)), count};
+    const Table<T> table{in<T>(start), in<T>(unit), out<T>(state[0]),
+                         out<T>(state[1]), out<T>(state[2]), count};
     run_batches<T, dim()>(samples, points.size(0), table, plan);
     return 0;
   });
@@ -404,16 +403,15 @@ State tuning_steps(const Tensor& given_points, const Tensor& given_indices,
 }
 
 }  // namespace tuning
+
+std::vector<Operator> tuning_operators() {
+  return {
+      {"tuning_steps(Tensor points, Tensor indices, Tensor labels, Tensor factors, Tensor start, "
+       "Tensor unit, Tensor offsets, Tensor mean, Tensor square, Tensor rates, Tensor penalties, "
+       "int num_points, int batch_size, int first_step, int total_steps, int warm_up, "
+       "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor, Tensor)",
+       &boxed<tuning::tuning_steps>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "tuning_steps(Tensor points, Tensor indices, Tensor labels, Tensor factors, Tensor start, "
-      "Tensor unit, Tensor offsets, Tensor mean, Tensor square, Tensor rates, Tensor penalties, "
-      "int num_points, int batch_size, int first_step, int total_steps, int warm_up, "
-      "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor, Tensor)");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("tuning_steps", TORCH_BOX(&lardhm::tuning::tuning_steps));
-}

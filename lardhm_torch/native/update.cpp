@@ -77,10 +77,10 @@ Tensor nearest_clusters(const Tensor& given_points, const Tensor& given_counts,
   check_moments(counts, means, scatters, means);
   const int64_t count = means.size(0), n = points.size(0);
   check(count > 0, "there must be at least one cluster");
-  const Tensor weights = torch::stable::new_zeros(means, {count});
-  const Tensor no_index = torch::stable::new_empty(means, {0}, ScalarType::Byte);
-  const Tensor raw = torch::stable::new_empty(scatters, scatters.sizes());
-  const Tensor owners = torch::stable::new_empty(points, {n}, ScalarType::Int);
+  const Tensor weights = new_zeros(means, {count});
+  const Tensor no_index = new_empty(means, {0}, ScalarType::Byte);
+  const Tensor raw = new_empty(scatters, scatters.sizes());
+  const Tensor owners = new_empty(points, {n}, ScalarType::Int);
   dispatch(means, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
@@ -130,9 +130,9 @@ Tensor feature_sums(const Tensor& given_points, const Tensor& centers, const Ten
   const Tensor points = tidy(given_points);
   check_rows("points", points, centers);
   const int64_t n = points.size(0), count = centers.size(0);
-  const Tensor weights = torch::stable::new_zeros(centers, {count});
+  const Tensor weights = new_zeros(centers, {count});
   const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
-  const Tensor sums = torch::stable::new_zeros(map.centers, {count});
+  const Tensor sums = new_zeros(map.centers, {count});
   k = std::min(k, count);
   if (n == 0 || k == 0) return sums;
   dispatch(map.centers, [&](auto type, auto dim) {
@@ -186,10 +186,10 @@ Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_po
   const Tensor points = tidy(given_points);
   check_rows("points", points, centers);
   const int64_t count = centers.size(0);
-  const Tensor weights = torch::stable::new_empty(centers, {count});
-  const Tensor no_index = torch::stable::new_empty(centers, {0}, ScalarType::Byte);
+  const Tensor weights = new_empty(centers, {count});
+  const Tensor no_index = new_empty(centers, {0}, ScalarType::Byte);
   const MapTensors map(centers, raw, weights, no_index, covariance_scale, min_lengthscale);
-  const Tensor found = torch::stable::new_empty(map.centers, {count}, ScalarType::Bool);
+  const Tensor found = new_empty(map.centers, {count}, ScalarType::Bool);
   bool* to = out<bool>(found);
   dispatch(map.centers, [&](auto type, auto dim) {
     using T = decltype(type);
@@ -208,22 +208,19 @@ Tensor reaching(const Tensor& centers, const Tensor& raw, const Tensor& given_po
 }
 
 }  // namespace
+
+std::vector<Operator> update_operators() {
+  return {
+      {"nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
+       "float radius) -> Tensor",
+       &boxed<nearest_clusters>},
+      {"feature_sums(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
+       "float covariance_scale, float min_lengthscale) -> Tensor",
+       &boxed<feature_sums>},
+      {"reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
+       "float covariance_scale, float min_lengthscale) -> Tensor",
+       &boxed<reaching>},
+  };
+}
+
 }  // namespace lardhm
-
-STABLE_TORCH_LIBRARY_FRAGMENT(lardhm, m) {
-  m.def(
-      "nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
-      "float radius) -> Tensor");
-  m.def(
-      "feature_sums(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
-      "float covariance_scale, float min_lengthscale) -> Tensor");
-  m.def(
-      "reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
-      "float covariance_scale, float min_lengthscale) -> Tensor");
-}
-
-STABLE_TORCH_LIBRARY_IMPL(lardhm, CPU, m) {
-  m.impl("nearest_clusters", TORCH_BOX(&lardhm::nearest_clusters));
-  m.impl("feature_sums", TORCH_BOX(&lardhm::feature_sums));
-  m.impl("reaching", TORCH_BOX(&lardhm::reaching));
-}

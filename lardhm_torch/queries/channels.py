@@ -26,13 +26,18 @@ def channel(model: OccupancyMap, points: TensorLike, name: str) -> Tensor:
         (...) values, or (..., C) of a channel with C values.
 
     Raises:
-        ValueError: the map has no such channel. Tiled maps have none.
+        ValueError: the map has no such channel.
     """
+    check_channel(model, name)
+    found: Any = model
+    values: Tensor = found.channel(points, name)
+    return values
+
+
+def check_channel(model: OccupancyMap, name: str) -> None:
+    """Raise a ValueError if a map has no channel of this name."""
     names = channel_names(model)
     if name not in names:
         raise ValueError(
             f"name must be a channel of the map, {', '.join(names) or 'which has none'}; got {name!r}"
         )
-    found: Any = model
-    values: Tensor = found.channel(points, name)
-    return values

@@ -16,9 +16,15 @@ from lardhm_torch.maps import (
     reads_map,
     to_tensor,
 )
-from lardhm_torch.queries.distance import height_and_side, nearest_faces, to_nearest
-from lardhm_torch.queries.faces import Faces, kernel_tensors, plates_of, surface_faces
+from lardhm_torch.queries.faces import kernel_tensors, surface_faces
 from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
+from lardhm_torch.queries.nearest_face import (
+    Faces,
+    height_and_side,
+    nearest_faces,
+    plates_of,
+    to_nearest,
+)
 
 MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
 LATTICE = 7  # points along each axis of a cluster at which the map is asked
@@ -61,7 +67,7 @@ def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -
     model = in_memory(model)
     local = points.reshape(-1, model.dim) - model.origin
     plates = obstacle_plates(model, threshold_log_odds(threshold) + EVIDENCE)
-    bounds = [to_nearest(local, part, torch.inf) for part in plates]
+    bounds = [to_nearest(local, part, torch.inf)[0] for part in plates]
     return torch.maximum(*bounds).reshape(points.shape[:-1])
 
 

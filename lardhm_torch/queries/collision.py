@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map, to_tensor
 from lardhm_torch.queries.hazard import HAZARD_LENGTH, sphere_points, swept_integral
-from lardhm_torch.queries.marching import Rays, march
+from lardhm_torch.queries.marching import Rays, expected_lengths
 from lardhm_torch.queries.raycasting import surface_step, unit_rays
 
 
@@ -139,7 +139,5 @@ def expected_range(
     lower, upper = starts.minimum(ends) - mover.radius, starts.maximum(ends) + mover.radius
     for rows, part in local_parts(model, lower.detach(), upper.detach()):
         rays = Rays(starts[rows], headings[rows], max_range, step, mover.length, body)
-        for steps in march(part, rays):
-            gone = steps.skipped + (steps.reached * steps.widths).sum(dim=1)
-            ranges = ranges.index_add(0, rows[steps.rows], gone)
+        ranges = ranges.index_copy(0, rows, expected_lengths(part, rays))
     return ranges.clamp(max=max_range)

@@ -1,16 +1,15 @@
-"""Exploration: frontiers of the known free space, and the information gain of a view."""
+"""Exploration: the information gain of a view."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from lardhm_torch import native
 from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map
-from lardhm_torch.queries.grids import EVIDENCE, grid_axes, query_grid
 from lardhm_torch.queries.hazard import NEGLIGIBLE, reached
 from lardhm_torch.queries.raycasting import unit_rays
 
@@ -20,64 +19,6 @@ KNOWN = 0.98  # probability of measured space; its entropy is no gain
 SAME_DIRECTION = 1e-6  # edge of the cubes in which unit vectors count once
 STEPS_AT_ONCE = 8
 NEIGHBORS = 8  # rays that tell how densely rays lie
-WALL_MARGIN = 0.3  # [m] around obstacles, where log-odds pass from free to occupied
-
-
-class Frontiers(NamedTuple):
-    """F frontier points.
-
-    ``points`` (F, D) float64 world positions [m]; ``groups`` (F,) index of the connected group of
-    each point, 0 for the largest group.
-    """
-
-    points: Tensor
-    groups: Tensor
-
-
-@torch.no_grad()
-@reads_map
-def frontiers(
-    model: OccupancyMap,
-    lower: TensorLike,
-    upper: TensorLike,
-    resolution: float = 0.1,
-    wall_margin: float = WALL_MARGIN,
-) -> Frontiers:
-    """Free grid points next to unknown space, in connected groups.
-
-    Points with log-odds below -1 are free, above 1 occupied, and unknown otherwise. Log-odds pass
-    through 0 between free space and a wall, so unknown points within ``wall_margin`` of an occupied
-    point are ignored.
-
-    Args:
-        model: the map.
-        lower: (D,) lower corner of the region, world frame [m].
-        upper: (D,) upper corner [m].
-        resolution: distance between neighboring points [m].
-        wall_margin: width of the ignored layer around obstacles [m].
-
-    Returns:
-        points and groups; grid points that touch, also diagonally, are in one group.
-
-    Raises:
-        ValueError: as for `query_grid`; or wall_margin is negative.
-    """
-    from scipy.ndimage import binary_dilation
-
-    if not wall_margin >= 0:
-        raise ValueError(f"wall_margin must be 0 m or more; got {wall_margin}")
-    probability = query_grid(model, lower, upper, resolution)
-    log_odds = torch.logit(probability.double()).cpu().numpy()
-    occupied, free = log_odds > EVIDENCE, log_odds < -EVIDENCE
-    steps = round(wall_margin / resolution)
-    if steps > 0:  # 0 iterations would mean: until nothing changes
-        occupied = binary_dilation(occupied, _with_diagonals(occupied.ndim), iterations=steps)
-    border = free & binary_dilation(~occupied & ~free)
-    device = model.origin.device
-    axes = grid_axes(lower, upper, resolution, device)
-    indices = [torch.from_numpy(index).to(device) for index in border.nonzero()]
-    points = torch.stack([axis[index] for axis, index in zip(axes, indices, strict=True)], dim=1)
-    return Frontiers(points, torch.from_numpy(_group_ranks(border)).to(device))
 
 
 @torch.no_grad()
@@ -139,8 +80,8 @@ def _gain(model: OccupancyMap, view: View, max_range: float, step: float) -> Ten
     """Gain of a view in a map held in memory [bits].
 
     Depths are divided into shells, each twice as deep as the one before. In a shell, one ray stands
-    for all in a bundle that is nowhere wider than a cell. Bundles of a shell lie within those of the
-    one before, whose hazard they take over.
+    for all in a bundle that is as wide as a cell in the middle of the shell, the geometric mean of its
+    depths. Bundles of a shell lie within those of the one before, whose hazard they take over.
     """
     total, near = view.spread.new_zeros(()), 0.0
     power = model.dim - 1
@@ -149,7 +90,7 @@ def _gain(model: OccupancyMap, view: View, max_range: float, step: float) -> Ten
     bundle_before = torch.zeros_like(view.spread, dtype=torch.long)  # of each ray
     for shell in range(shells):
         far = max_range / 2 ** (shells - 1 - shell)
-        first, bundle = _first_of_each(_direction_keys(view.headings, CELL / far))
+        first, bundle = _first_of_each(_direction_keys(view.headings, math.sqrt(2) * CELL / far))
         members = torch.bincount(bundle)
         parts = torch.zeros_like(view.spread[first]).index_add(0, bundle, view.spread**power)
         before = met[bundle_before[first]]
@@ -160,8 +101,8 @@ def _gain(model: OccupancyMap, view: View, max_range: float, step: float) -> Ten
             numbers = torch.arange(start, min(count, start + STEPS_AT_ONCE), device=rows.device)
             depths = near + (numbers + 0.5) * width
             origins, headings = (t[first[rows], None] for t in view[:2])
-            log_odds = model.log_odds(origins + depths[:, None] * headings).double()
-            hazard = log_odds.clamp(min=0) * (width / SIGHT_LENGTH)
+            log_odds = model.log_odds(origins + depths[:, None] * headings)
+            hazard = log_odds.double().clamp(min=0) * (width / SIGHT_LENGTH)
             crossed = parts[rows, None] * (depths / CELL) ** power  # cells, as wide as the bundle
             crossed = torch.minimum(crossed, members[rows, None].to(crossed))
             bits = crossed * (width / CELL) * _entropy_above_known(log_odds)
@@ -209,28 +150,20 @@ def ray_spread(headings: Tensor) -> Tensor:
 
     In a cone that reaches to the k-th neighbor there are k rays.
     """
-    from scipy.spatial import cKDTree
-
     count, dim = headings.shape
     neighbors = min(NEIGHBORS, count - 1)
     if neighbors < 1 or dim == 1:
         return headings.new_full((count,), torch.inf)
-    directions = headings.cpu()
-    chords = cKDTree(directions).query(directions, k=neighbors + 1)[0][:, neighbors]
+    chords = _farthest_neighbor(headings.cpu(), neighbors + 1).to(headings)
     cone = math.pi * chords**2 if dim == 3 else 2 * chords
-    widths = (cone / neighbors) ** (1 / (dim - 1))
-    return torch.as_tensor(widths, device=headings.device, dtype=headings.dtype)
+    return (cone / neighbors) ** (1 / (dim - 1))
 
 
-def _with_diagonals(dim: int) -> np.ndarray:
-    """(3, ..., 3) neighborhood of a grid point that includes the diagonal neighbors."""
-    return np.ones((3,) * dim, dtype=bool)
+def _farthest_neighbor(points: Tensor, count: int) -> Tensor:
+    """(N,) distance of the last of the nearest ``count`` of (N, D) points, each being its own first."""
+    if native.supports(points):
+        rows = native.nearest_centers(points, points, count)
+        return torch.linalg.vector_norm(points[rows] - points[:, None], dim=2).amax(dim=1)
+    from scipy.spatial import cKDTree
 
-
-def _group_ranks(mask: np.ndarray) -> np.ndarray:
-    """(F,) rank of the connected group of each True point of a mask, 0 for the largest group."""
-    from scipy.ndimage import label
-
-    labels = label(mask, _with_diagonals(mask.ndim))[0][mask] - 1
-    by_size = np.argsort(-np.bincount(labels), kind="stable")
-    return np.argsort(by_size, kind="stable")[labels]
+    return torch.from_numpy(cKDTree(points).query(points, k=count)[0][:, -1])

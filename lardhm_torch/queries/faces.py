@@ -4,7 +4,8 @@ The hits of a cluster lie in a plate: its plane goes through their mean, across 
 least variance. A plate has a face on each side from which it was seen, one standard deviation of the
 hits in front of their mean: nearest hits are that far in front of the mean of noisy hits. Its edges
 are those of hits spread evenly. It ends earlier where the log-odds fall, and counts only if the map
-holds its center to be occupied.
+holds its center to be occupied. Hits that a cluster keeps, and that no face comes near, are faces without
+an extent: stray hits, and those beyond the edges.
 
 The faces of a map are kept. After an update only those near changed clusters are made again.
 """
@@ -19,35 +20,22 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.maps import OccupancyMap, covariance_scale, num_neighbors, stored_moments
+from lardhm_torch.maps import (
+    OccupancyMap,
+    covariance_scale,
+    kept_hits,
+    num_neighbors,
+    stored_moments,
+)
 from lardhm_torch.queries.grids import EVIDENCE
+from lardhm_torch.queries.nearest_face import Faces, face_distances, nearest_faces
 
 EDGE = math.sqrt(3)  # half edge of a uniform distribution, in standard deviations
 FADES = 0.4  # of the log-odds at the center: a plate ends where they are below this
 STEPS = 4  # from the center to an edge at which the log-odds are compared
 SIDES = (0.15, 0.3)  # [m] in front of a face, where a sensor that saw it left free space
+NEAR = 3.0  # standard deviations of the hits of a face: the others are not near it
 CHUNK_CLUSTERS = 1 << 14
-
-
-@dataclass(frozen=True, eq=False)
-class Faces:
-    """F rectangles with rounded corners; the rounding's radius is the shortest half edge.
-
-    Attributes:
-        centers: (F, D) float64, map frame [m].
-        axes: (F, D, D) float64 orthonormal columns: the normal, into free space, then the edges.
-        half: (F, D - 1) float64 half edges [m].
-        thickness: (F,) float64 half thickness of plates [m]; (0,) for faces, which have a front.
-        noise: (F,) float64 standard deviation of the hits across a face [m]; (0,) for plates.
-        tree: of the native search; empty where it is not available.
-    """
-
-    centers: Tensor
-    axes: Tensor
-    half: Tensor
-    thickness: Tensor
-    noise: Tensor
-    tree: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +43,12 @@ class _Plates:
     """Plates of the M clusters of a map, and the tensors that they were made from.
 
     ``is_surface`` (M,); ``is_seen`` (M, 2) from the side of the normal and from the other;
-    ``centers`` (M, D), ``axes`` (M, D, D) and ``half`` (M, D), the thickness first.
+    ``centers`` (M, D), ``axes`` (M, D, D) and ``half`` (M, D), the thickness first; ``is_bare``
+    (M, K) whether a kept hit is near no face.
     """
 
     source: tuple[Tensor, ...]
+    is_bare: Tensor
     is_surface: Tensor
     is_seen: Tensor
     centers: Tensor
@@ -78,8 +68,11 @@ def surface_faces(model: OccupancyMap) -> Faces:
         before = plates.source
         if all(map(torch.equal, source, before)):
             return faces
-    plates = _updated(model, source, plates)
-    faces = _faces_of(plates)
+    plates, rows = _updated(model, source, plates)
+    faces, hits = _faces_of(plates), kept_hits(model)
+    if hits is not None:
+        _find_bare(model, rows, hits, (plates, faces))
+        faces = _with_bare(faces, hits, plates)
     _kept[model] = plates, faces
     return faces
 
@@ -111,13 +104,17 @@ def _moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def _updated(model: OccupancyMap, source: tuple[Tensor, ...], old: _Plates | None) -> _Plates:
-    """Plates of the map: the old ones, and new ones where a cluster near them has changed."""
+def _updated(
+    model: OccupancyMap, source: tuple[Tensor, ...], old: _Plates | None
+) -> tuple[_Plates, Tensor]:
+    """Plates of the map: the old ones, and new ones, in some rows, where a cluster nearby has changed."""
     origin, weights, centers = source[:3]
     is_hit, means, covariances = _moments(model)
-    dim, count = model.dim, len(weights)
+    dim, count, hits = model.dim, len(weights), kept_hits(model)
+    capacity = 0 if hits is None else hits.shape[1]
     new = _Plates(
         tuple(tensor.clone() for tensor in source),
+        torch.zeros(count, capacity, dtype=torch.bool, device=origin.device),
         torch.zeros_like(is_hit),
         torch.zeros(count, 2, dtype=torch.bool, device=origin.device),
         torch.zeros(count, dim, dtype=torch.float64, device=origin.device),
@@ -125,20 +122,30 @@ def _updated(model: OccupancyMap, source: tuple[Tensor, ...], old: _Plates | Non
         torch.zeros(count, dim, dtype=torch.float64, device=origin.device),
     )
     rows = is_hit.nonzero().squeeze(1)
+    everything = rows
     if old is not None and torch.equal(old.source[0], origin) and len(old.source[1]) <= count:
         kept = len(old.source[1])
-        for name in ("is_surface", "is_seen", "centers", "axes", "half"):
+        for name in ("is_bare", "is_surface", "is_seen", "centers", "axes", "half"):
             getattr(new, name)[:kept] = getattr(old, name)
         changed = torch.ones(count, dtype=torch.bool, device=origin.device)
         changed[:kept] = False
         for ours, theirs in zip(source[1:], old.source[1:], strict=True):
             changed[:kept] |= (ours[:kept] != theirs).reshape(kept, -1).any(dim=1)
         new.is_surface[changed] = False
+        new.is_bare[changed] = False
         places = torch.cat([centers[changed], old.source[2][changed[:kept]]])
         rows = rows[changed[rows] | _near(model, means[rows], places)]
     for some in rows.split(CHUNK_CLUSTERS):
         _make_plates(model, some, (means[some], covariances[some]), new)
-    return new
+    if len(rows) == len(everything) or hits is None or old is None:
+        return new, everything
+    before = torch.cat([rows[rows < kept], changed[:kept].nonzero().squeeze(1)])
+    parts = ((new.centers, new.half, rows), (old.centers, old.half, before))
+    centers, half = (torch.cat([part[i][part[2]] for part in parts]) for i in range(2))
+    spread = torch.linalg.vector_norm(hits[everything] - means[everything, None], dim=2)
+    reach = torch.where(spread.isfinite(), spread, 0.0).amax(dim=1)
+    reach = reach + (1 + NEAR) * torch.linalg.vector_norm(half, dim=1).amax()
+    return new, everything[_distance_to(means[everything], centers) <= reach]
 
 
 def _near(model: OccupancyMap, means: Tensor, places: Tensor) -> Tensor:
@@ -148,8 +155,14 @@ def _near(model: OccupancyMap, means: Tensor, places: Tensor) -> Tensor:
     centers = model.centers.detach()
     farthest = native.nearest_centers(means, centers, num_neighbors(model))
     reach = torch.linalg.vector_norm(centers[farthest] - means[:, None], dim=2).amax(dim=1)
-    closest = places[native.nearest_centers(means, places, 1).squeeze(1)]
-    return torch.linalg.vector_norm(closest - means, dim=1) <= reach + 4 * max(SIDES)
+    return _distance_to(means, places) <= reach + 4 * max(SIDES)
+
+
+def _distance_to(points: Tensor, places: Tensor) -> Tensor:
+    """(N,) distance of (N, D) points to the nearest of some places."""
+    places = places.to(points.dtype)
+    closest = places[native.nearest_centers(points, places, 1).squeeze(1)]
+    return torch.linalg.vector_norm(closest - points, dim=1)
 
 
 def _make_plates(
@@ -212,7 +225,32 @@ def _faces_of(plates: _Plates) -> Faces:
     return Faces(centers, axes, half, nothing, noise, tree)
 
 
-def plates_of(centers: Tensor, axes: Tensor, half: Tensor, thickness: Tensor) -> Faces:
-    """Plates, which have a thickness, with a tree to search them."""
-    given = (centers, axes, half, thickness)
-    return Faces(*given, thickness[:0], native.face_tree(*given))
+def _find_bare(
+    model: OccupancyMap, rows: Tensor, hits: Tensor, made: tuple[_Plates, Faces]
+) -> None:
+    """Find the kept hits of some clusters that the map holds to be occupied, but no face is near."""
+    plates, faces = made
+    plates.is_bare[rows] = False
+    kept = hits[rows].isfinite().all(dim=2).nonzero()
+    row, column = rows[kept[:, 0]], kept[:, 1]
+    points = hits[row, column].double()
+    nearest = nearest_faces(points, faces, math.inf)
+    away = face_distances(points, faces, nearest, math.inf).abs()
+    far = nearest < 0
+    if len(faces.noise):
+        far |= away > NEAR * faces.noise[nearest]
+    row, column, points = row[far], column[far], points[far]
+    plates.is_bare[row, column] = model.log_odds(points + plates.source[0]) > 0
+
+
+def _with_bare(faces: Faces, hits: Tensor, plates: _Plates) -> Faces:
+    """The faces, and those without an extent."""
+    row, column = plates.is_bare.nonzero().unbind(dim=1)
+    axes, seen = plates.axes[row].clone(), plates.is_seen[row]
+    axes[:, :, 0] *= torch.where(seen[:, 0] | ~seen[:, 1], 1.0, -1.0)[:, None]
+    points, nothing = hits[row, column].double(), axes.new_zeros(len(row), hits.shape[2])
+    centers, axes = torch.cat([faces.centers, points]), torch.cat([faces.axes, axes])
+    half = torch.cat([faces.half, nothing[:, 1:]])
+    noise = torch.cat([faces.noise, nothing[:, 0]])
+    tree = native.face_tree(centers, axes, half, faces.thickness)
+    return Faces(centers, axes, half, faces.thickness, noise, tree)

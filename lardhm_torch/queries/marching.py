@@ -9,7 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lardhm_torch.maps import OccupancyMap, native_ranges
+from lardhm_torch import native
+from lardhm_torch.maps import OccupancyMap, native_map, native_ranges
 from lardhm_torch.queries.hazard import NEGLIGIBLE, reached
 from lardhm_torch.queries.raycasting import March
 
@@ -42,6 +43,30 @@ class Steps(NamedTuple):
     skipped: Tensor
     widths: Tensor
     reached: Tensor
+
+
+def expected_lengths(model: OccupancyMap, rays: Rays) -> Tensor:
+    """(R,) expected lengths of rays that end with the hazard of the next step [m]; differentiable.
+
+    Without gradients, and for a point, the native library computes the same from one pass.
+
+    Args:
+        model: a map held in memory.
+        rays: the rays.
+    """
+    asked = (rays.origins, rays.directions, model.weights, model.centers, model.scale_tril)
+    follows = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in asked)
+    found = None if follows or len(rays.body) > 1 else native_map(model)
+    if found is not None:
+        count = math.ceil(rays.max_range / rays.step - 1e-9)
+        rule = (rays.max_range / count, rays.max_range, rays.length, NO_HAZARD, NEGLIGIBLE)
+        local = (rays.origins - found.origin, rays.directions)
+        return native.expected_ranges(local, rule, found[:3], found.kernel, found.center_index)
+    lengths = rays.origins.new_zeros(len(rays.origins))
+    for steps in march(model, rays):
+        gone = steps.skipped + (steps.reached * steps.widths).sum(dim=1)
+        lengths = lengths.index_add(0, steps.rows, gone)
+    return lengths
 
 
 def march(model: OccupancyMap, rays: Rays) -> Iterator[Steps]:

@@ -1,7 +1,7 @@
 """Ray casting: distance to the first obstacle along each ray.
 
 This is the definition, in plain torch: it evaluates every step of every ray. The native kernel gives
-the same ranges and skips the intervals of a ray in which no obstacle can be.
+the same ranges and passes over cells of an octree in which no obstacle can be.
 """
 
 from __future__ import annotations

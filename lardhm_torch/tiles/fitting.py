@@ -19,13 +19,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.atomic_files import remove_partials
 from lardhm_torch.io.map_files import SAFETENSORS
+from lardhm_torch.learning.channel_sums import Hits, Layout, joint_layout, with_hits, with_layout
 from lardhm_torch.learning.fitting import FitConfig
-from lardhm_torch.learning.map_state import new_rows
+from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.parameters import write_state
 from lardhm_torch.tiles.cluster_files import (
     clustered_points,
@@ -65,6 +67,7 @@ from lardhm_torch.tiles.training import (
     make_budget,
     train_tile,
 )
+from lardhm_torch.tiles.values import read_values
 
 MOST_POINTS = 1 << 23  # a tile with more is fitted to so many of its points
 CLUSTERING_RATIO = 0.45  # of the time of a fit, for the progress bar
@@ -189,12 +192,29 @@ class _Job:
         model = LardHilbertMap(**self.manifest.settings).to(weights)
         origin = torch.tensor(self._origin(index), device=self.device)
         rows = new_rows(clusters, own.is_occupied, kernel.min_lengthscale)
-        write_state(model, replace(rows, weights=weights, raw_scale_tril=raw), origin)
+        state = replace(rows, weights=weights, raw_scale_tril=raw)
+        write_state(model, *self._with_channels(index, state, origin))
         path = self._fitted_path(index, SAFETENSORS)
         model.cpu().save(path, evidence=False)
         record = tile_record(model, path, self.ledger.tiles[index].core)
         body = {"chunks": self.ledger.chunks, "tile": tile_to_json(record)}
         write_page(self._fitted_path(index, ".json"), body, durable=False)
+
+    def _with_channels(
+        self, index: Index, state: MapState, origin: Tensor
+    ) -> tuple[MapState, Tensor, Layout]:
+        """The clusters with the channels of the tile's hits, origin and layout."""
+        num_bytes = self.ledger.values.get(index, 0)
+        if not num_bytes:
+            return state, origin, {}
+        layout = self.ledger.channels
+        state = with_layout(state, {}, layout)
+        shift = torch.from_numpy(self._corner(index) - self._origin(index)).to(state.means)
+        for points, channels in read_values(self.folder, index, num_bytes):
+            moved = points.to(state.means) + shift
+            there = {name: values.to(self.device) for name, values in channels.items()}
+            state = with_hits(state, layout, Hits(moved, there))
+        return state, origin, layout
 
     def _points(self, index: Index) -> TilePoints:
         """The training points of a tile in the frame of its map."""
@@ -261,7 +281,9 @@ class _Job:
             path = self._fitted_path(index, SAFETENSORS)
             if path.is_file():
                 os.replace(path, tile_path(self.folder, index))
-        write_manifest(self.folder, replace(self.manifest, tiles={**self.manifest.tiles, **found}))
+        tiles = {**self.manifest.tiles, **found}
+        channels = joint_layout(self.manifest.channels, self.ledger.channels)
+        write_manifest(self.folder, replace(self.manifest, tiles=tiles, channels=channels))
         shutil.rmtree(self.folder / "fitted")
         for folder in (self.folder, self.folder / "clusters"):
             remove_partials(folder)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from lardhm_torch.learning.channel_sums import joint_layout
 from lardhm_torch.tiles.entries import Tile
 from lardhm_torch.tiles.indexing import (
     Folder,
@@ -15,6 +17,7 @@ from lardhm_torch.tiles.indexing import (
     samples_path,
     tile_path,
     touching_tiles,
+    values_path,
 )
 from lardhm_torch.tiles.ledger import Counts, Ledger, read_ledger, write_ledger
 from lardhm_torch.tiles.manifest import Manifest, read_manifest, write_manifest
@@ -64,9 +67,12 @@ def join_folders(first: Folder, second: Folder, target: Folder) -> Manifest:
         chunks=sum(part.chunks for part in ledgers),
         rays=sum(part.rays for part in ledgers),
         complete=True,
+        values=dict(Counter(sources[0].values) + Counter(sources[1].values)),
+        channels=joint_layout(ledgers[0].channels, ledgers[1].channels),
     )
     write_ledger(goal, ledger)
-    joined = replace(manifests[0], tiles=tiles)
+    channels = joint_layout(manifests[0].channels, manifests[1].channels)
+    joined = replace(manifests[0], tiles=tiles, channels=channels)
     write_manifest(goal, joined)
     return joined
 
@@ -99,26 +105,32 @@ class _Source:
 
     def __init__(self, folder: Path, manifest: Manifest, ledger: Ledger, shift: Index) -> None:
         self.folder, self.manifest, self.shift = folder, manifest, shift
-        self.counts = {
-            tuple(i + s for i, s in zip(index, shift, strict=True)): counts
-            for index, counts in ledger.tiles.items()
-        }
+        self.counts = {self._index_there(index): n for index, n in ledger.tiles.items()}
+        self.values = {self._index_there(index): n for index, n in ledger.values.items()}
         self.cores = {index for index, counts in self.counts.items() if counts.core}
 
     def append_samples(self, goal: Path) -> None:
         """Append all records that count to the files of the new folder."""
         size = record_type(self.manifest.dim).itemsize
         for index, counts in self.counts.items():
-            with (
-                open(samples_path(self.folder, self._index_here(index)), "rb") as ours,
-                open(samples_path(goal, index), "ab") as file,
-            ):
-                left = size * sum(counts)
-                while left and (content := ours.read(min(left, 1 << 24))):
-                    file.write(content)
-                    left -= len(content)
-            if left:
-                raise ValueError(f"{ours.name} is {left} bytes too short: tile the scans again")
+            self._append(samples_path, index, goal, size * sum(counts))
+        for index, num_bytes in self.values.items():
+            values_path(goal, index).parent.mkdir(exist_ok=True)
+            self._append(values_path, index, goal, num_bytes)
+
+    def _append(
+        self, path_of: Callable[[Path, Index], Path], index: Index, goal: Path, left: int
+    ) -> None:
+        """Append the first bytes of a tile's file to that of the new folder."""
+        with (
+            open(path_of(self.folder, self._index_here(index)), "rb") as ours,
+            open(path_of(goal, index), "ab") as file,
+        ):
+            while left and (content := ours.read(min(left, 1 << 24))):
+                file.write(content)
+                left -= len(content)
+        if left:
+            raise ValueError(f"{ours.name} is {left} bytes too short: tile the scans again")
 
     def copy_fitted(self, goal: Path, others: set[Index]) -> dict[Index, Tile]:
         """Copy clusters and tiles that points of the other folder do not change.
@@ -144,6 +156,9 @@ class _Source:
                 shutil.copyfile(tile_path(self.folder, ours), tile_path(goal, index))
                 entries[index] = entry
         return entries
+
+    def _index_there(self, index: Index) -> Index:
+        return tuple(i + s for i, s in zip(index, self.shift, strict=True))
 
     def _index_here(self, index: Index) -> Index:
         return tuple(i - s for i, s in zip(index, self.shift, strict=True))

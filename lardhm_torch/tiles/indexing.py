@@ -56,6 +56,11 @@ def samples_path(folder: Folder, index: Index) -> Path:
     return Path(folder) / "samples" / tile_name(index)
 
 
+def values_path(folder: Folder, index: Index) -> Path:
+    """The channels of the hits of a tile."""
+    return Path(folder) / "values" / tile_name(index)
+
+
 def clusters_path(folder: Folder, index: Index) -> Path:
     """The clusters of a tile's own points, while the folder is fitted."""
     return Path(folder) / "clusters" / tile_name(index)

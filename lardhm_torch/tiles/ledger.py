@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lardhm_torch.learning.channel_sums import Layout, check_layout
 from lardhm_torch.tiles.indexing import Folder, Index, tile_index, tile_name
 from lardhm_torch.tiles.manifest import read_page, write_page
 from lardhm_torch.tiles.records import Records, record_type
@@ -50,12 +51,16 @@ class Ledger:
         chunks: number of pieces of the scans whose points are in the files.
         rays: number of rays in those pieces.
         complete: whether these are all scans.
+        values: bytes of the channels of each tile that has any (`values`).
+        channels: layout of all channels (`channel_sums`).
     """
 
     tiles: Mapping[Index, Counts] = field(default_factory=dict)
     chunks: int = 0
     rays: int = 0
     complete: bool = False
+    values: Mapping[Index, int] = field(default_factory=dict)
+    channels: Layout = field(default_factory=dict)
 
     @property
     def cores(self) -> list[Index]:
@@ -72,7 +77,11 @@ def count_records(records: Records) -> Counts:
 def write_ledger(folder: Folder, ledger: Ledger) -> None:
     """Write the ledger atomically; from then on its records count."""
     tiles = {tile_name(index): list(counts) for index, counts in sorted(ledger.tiles.items())}
-    write_page(Path(folder) / LEDGER_NAME, {**vars(ledger), "tiles": tiles})
+    values = {tile_name(index): size for index, size in sorted(ledger.values.items())}
+    body = {**vars(ledger), "tiles": tiles, "values": values}
+    if not values:
+        del body["values"], body["channels"]
+    write_page(Path(folder) / LEDGER_NAME, body)
 
 
 def read_ledger(folder: Folder) -> Ledger:
@@ -91,7 +100,9 @@ def read_ledger(folder: Folder) -> Ledger:
     try:
         body = read_page(path)
         tiles = {tile_index(name): Counts(*map(int, row)) for name, row in body["tiles"].items()}
-        return Ledger(**{**body, "tiles": tiles})
+        values = {tile_index(name): int(n) for name, n in body.get("values", {}).items()}
+        channels = check_layout(body.get("channels", {}))
+        return Ledger(**{**body, "tiles": tiles, "values": values, "channels": channels})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path} must be the ledger of a tiled map, whole; {error}") from error
 
@@ -121,11 +132,18 @@ def appending(folder: Folder, dim: int) -> Iterator[Ledger]:
 
 def _roll_back(folder: Folder, dim: int) -> Ledger:
     """Remove all records that the ledger does not count."""
-    ledger = read_ledger(folder)
-    parent = Path(folder) / "samples"
+    ledger, size = read_ledger(folder), record_type(dim).itemsize
+    records = {tile_name(index): size * sum(counts) for index, counts in ledger.tiles.items()}
+    _truncate_files(Path(folder) / "samples", records)
+    if ledger.values or (Path(folder) / "values").is_dir():
+        values = {tile_name(index): size for index, size in ledger.values.items()}
+        _truncate_files(Path(folder) / "values", values)
+    return ledger
+
+
+def _truncate_files(parent: Path, wanted: Mapping[str, int]) -> None:
+    """Truncate files to the wanted numbers of bytes, by name, and remove all others."""
     parent.mkdir(exist_ok=True)
-    size = record_type(dim).itemsize
-    wanted = {tile_name(index): size * sum(counts) for index, counts in ledger.tiles.items()}
     with os.scandir(parent) as entries:
         found = {entry.name: entry.stat().st_size for entry in entries}
     for name, length in found.items():
@@ -139,4 +157,3 @@ def _roll_back(folder: Folder, dim: int) -> Ledger:
             f"{parent / short[0]} must hold {wanted[short[0]]} bytes; got {found.get(short[0], 0)}. "
             "The file was truncated: tile the scans again"
         )
-    return ledger

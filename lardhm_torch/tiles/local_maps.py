@@ -12,7 +12,7 @@ from lardhm_torch.tiles.blocks import block_box, blocks_of
 from lardhm_torch.tiles.indexing import tile_indices
 from lardhm_torch.tiles.layout import FLOAT32_RANGE, layout_of, needed_tiles
 from lardhm_torch.tiles.splitting import TileState, join_states
-from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore, cluster_bytes
+from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore
 
 
 class LocalMaps:
@@ -24,7 +24,7 @@ class LocalMaps:
     """
 
     def __init__(self, store: TileStore, limit: int) -> None:
-        self.store, self.cache = store, Cache(limit)
+        self.store, self.cache = store, Cache(limit, store.bytes_per_cluster)
         self.layout = layout_of(store.manifest)
         self.origin = torch.tensor(store.manifest.origin, dtype=torch.float64, device=store.device)
         self._blocks = blocks_of(self.layout)
@@ -130,13 +130,15 @@ class LocalMaps:
         return ((lower + upper) / 2).round().to(self.origin)
 
     def _join(self, tiles: list[TileState], origin: Tensor) -> LardHilbertMap:
-        model = join_states(tiles, self.store.manifest.settings, origin)
+        manifest = self.store.manifest
+        channels = manifest.channels, manifest.class_scale
+        model = join_states(tiles, manifest.settings, origin, *channels)
         return model.to(self.store.device, self.store.dtype)
 
     def _make_room(self, rows: Tensor, purpose: str) -> None:
         """Drop cached entries so that these tiles and the map of them fit the limit."""
         clusters = int(self.layout.counts[rows].sum())
-        bytes_each = cluster_bytes(len(self.origin), self.store.dtype)
+        bytes_each = self.store.bytes_per_cluster
         needed = 2 * clusters * bytes_each
         if needed > self.cache.limit:
             raise ValueError(

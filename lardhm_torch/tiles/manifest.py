@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.learning.channel_sums import Layout, check_layout
 from lardhm_torch.tiles.entries import (
     Tile,
     check_number,
@@ -29,6 +30,7 @@ FORMAT_VERSION = 3  # of the folder; 3: tiles are stored as safetensors
 MANIFEST_NAME = "manifest.json"
 DTYPES = ("float32", "float64")
 SETTINGS = ("dim", "num_neighbors", "covariance_scale", "min_lengthscale")
+OPTIONAL = {"channels": {}, "class_scale": 1.0}  # fields of maps with channels alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +47,8 @@ class Manifest:
         fitting: the `FitConfig` of the tiles, as plain values.
         seed: random seed of sampling, clustering and training.
         tiles: entries of the fitted tiles by index. Tiles without points have none.
+        channels: layout of the channels of all tiles (`channel_sums`); a tile may have fewer.
+        class_scale: factor on the class log-odds (`LardHilbertMap.calibrate_classes`).
 
     Raises:
         ValueError: a field is out of range; the message names it.
@@ -59,6 +63,8 @@ class Manifest:
     fitting: Mapping[str, Any] = field(default_factory=dict)
     seed: int = 0
     tiles: Mapping[Index, Tile] = field(default_factory=dict)
+    channels: Layout = field(default_factory=dict)
+    class_scale: float = 1.0
 
     def __post_init__(self) -> None:
         check_number("edge", self.edge, 0.0)
@@ -73,6 +79,10 @@ class Manifest:
                 raise ValueError(f"{name} must be a table; got {getattr(self, name)!r}")
         _check_settings(self.settings)
         check_position("origin", self.origin, self.dim)
+        check_layout(self.channels)
+        check_number("class_scale", self.class_scale, 0.0)
+        if not self.class_scale > 0:
+            raise ValueError(f"class_scale must be > 0; got {self.class_scale}")
         for index, tile in self.tiles.items():
             if not isinstance(index, tuple) or len(index) != self.dim:
                 raise ValueError(
@@ -106,7 +116,8 @@ def write_manifest(folder: Folder, manifest: Manifest) -> None:
     tiles = {tile_name(index): tile_to_json(tile) for index, tile in sorted(manifest.tiles.items())}
     plain = {name: dict(getattr(manifest, name)) for name in ("settings", "sampling", "fitting")}
     body = {**vars(manifest), **plain, "origin": list(manifest.origin), "tiles": tiles}
-    write_page(Path(folder) / MANIFEST_NAME, body)
+    used = {name: value for name, value in body.items() if OPTIONAL.get(name) != value}
+    write_page(Path(folder) / MANIFEST_NAME, used)
 
 
 def read_manifest(folder: Folder) -> Manifest:
@@ -130,6 +141,7 @@ def read_manifest(folder: Folder) -> Manifest:
 
 def _from_json(body: dict[str, Any]) -> Manifest:
     fields = set(Manifest.__dataclass_fields__)
+    body = {**OPTIONAL, **body}
     if set(body) != fields:
         missing, unknown = sorted(fields - set(body)), sorted(set(body) - fields)
         raise ValueError(f"its fields must be those of a manifest; {missing=}, {unknown=}")

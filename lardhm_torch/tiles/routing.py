@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.learning.channel_sums import hits_with_channels, joint_layout, layout_of
 from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.sampling import SamplingConfig, sample_rays, usable_rays
 from lardhm_torch.scans import Scans
@@ -26,6 +27,7 @@ from lardhm_torch.tiles.ledger import (
 )
 from lardhm_torch.tiles.manifest import MANIFEST_NAME, Manifest, read_manifest, write_manifest
 from lardhm_torch.tiles.records import Grid, Records, append_records, route
+from lardhm_torch.tiles.values import append_values, route_values
 
 BUFFER_BYTES = 1 << 28  # of records in memory, before they are appended to their files
 HALO = 0.5  # [m] by default
@@ -190,7 +192,9 @@ class _Router:
         self.grid = Grid(manifest.origin, manifest.edge, manifest.halo)
         self.done, self.adds, self.tiles = done, done.complete, dict(done.tiles)
         self.chunks, self.rays = (done.chunks, done.rays) if self.adds else (0, 0)
+        self.values, self.channels = dict(done.values), done.channels
         self.buffers: dict[Index, list[Records]] = {}
+        self.value_buffers: dict[Index, list[bytes]] = {}
         self.buffered = 0
 
     def take(self, piece: Scans) -> None:
@@ -211,6 +215,12 @@ class _Router:
         for index, records in route(samples.points, samples.labels, self.grid):
             self.buffers.setdefault(index, []).append(records)
             self.buffered += records.nbytes
+        hits = hits_with_channels(samples.points, samples.labels, samples.channels)
+        if len(hits.points):
+            self.channels = joint_layout(self.channels, layout_of(hits.channels))
+            for index, block in route_values(hits, self.grid):
+                self.value_buffers.setdefault(index, []).append(block)
+                self.buffered += len(block)
         if self.buffered >= BUFFER_BYTES:
             self._flush()
             if not self.adds:
@@ -236,9 +246,20 @@ class _Router:
             records = np.concatenate(parts)
             append_records(self.folder, index, records)
             self.tiles[index] = self.tiles.get(index, Counts()).plus(count_records(records))
-        self.buffers, self.buffered = {}, 0
+        for index, blocks in self.value_buffers.items():
+            content = b"".join(blocks)
+            append_values(self.folder, index, content)
+            self.values[index] = self.values.get(index, 0) + len(content)
+        self.buffers, self.value_buffers, self.buffered = {}, {}, 0
 
     def _commit(self, complete: bool) -> Ledger:
-        ledger = Ledger(tiles=self.tiles, chunks=self.chunks, rays=self.rays, complete=complete)
+        ledger = Ledger(
+            tiles=self.tiles,
+            chunks=self.chunks,
+            rays=self.rays,
+            complete=complete,
+            values=self.values,
+            channels=self.channels if self.values else {},
+        )
         write_ledger(self.folder, ledger)
         return ledger

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.learning.channel_sums import Layout, moved_sums
 from lardhm_torch.learning.map_state import HISTORY, PER_MAP
 from lardhm_torch.tiles.entries import tile_record
 from lardhm_torch.tiles.indexing import Folder, tile_indices, tile_path
@@ -24,11 +25,6 @@ def split_map(model: LardHilbertMap, folder: Folder, edge: float) -> None:
     folder = Path(folder)
     if len(model) == 0:
         raise ValueError("the map must hold clusters to be split; it is empty: fit it first")
-    if model.channel_layout:
-        raise ValueError(
-            f"tiles cannot hold channels; the map has {', '.join(model.channel_layout)}. "
-            "Split a copy without them: copy.deepcopy(model).drop_channels()"
-        )
     if (folder / MANIFEST_NAME).exists():
         raise FileExistsError(f"{folder} must be a new folder; it holds a tiled map already")
     manifest = Manifest(
@@ -36,6 +32,8 @@ def split_map(model: LardHilbertMap, folder: Folder, edge: float) -> None:
         origin=tuple(model.origin.tolist()),
         settings=model.settings,
         dtype=str(model.centers.dtype).removeprefix("torch."),
+        channels=model.channel_layout,
+        class_scale=model.class_scale,
     )
     tile_path(folder, (0,)).parent.mkdir(parents=True, exist_ok=True)
     owners = tile_indices(model.centers.detach(), [0.0] * model.dim, edge)
@@ -69,7 +67,11 @@ def state_of(model: LardHilbertMap) -> TileState:
 
 @torch.no_grad()
 def join_states(
-    states: list[TileState], settings: Mapping[str, Any], origin: Tensor
+    states: list[TileState],
+    settings: Mapping[str, Any],
+    origin: Tensor,
+    channels: Layout | None = None,
+    class_scale: float = 1.0,
 ) -> LardHilbertMap:
     """One map of the clusters of several.
 
@@ -81,17 +83,24 @@ def join_states(
         states: tensors of each map.
         settings: arguments of `LardHilbertMap`.
         origin: (D,) float64 origin of the result, world frame [m].
+        channels: layout of the channels of all states; None: they have none.
+        class_scale: factor on the class log-odds of the result.
     """
     result = LardHilbertMap(**settings)
     if states:
         parts = [_in_frame(state, origin) for state in states]
         tensors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        if "class_weights" in tensors and not bool(tensors["class_weights"].any()):
+            del tensors["class_weights"]  # no tile has trained ones
         result = result.to(states[0]["centers"])
         scales = torch.stack([state["posterior_scales"] for state in states])
         if not torch.equal(scales, scales[:1].expand_as(scales)):
             tensors["posterior_variances"].zero_()
-        whole = {"origin": origin, "posterior_scales": scales[0]}
-        result.load_state_dict({**tensors, **whole, "_extra_state": result.get_extra_state()})
+        extra = result.get_extra_state()
+        if channels:
+            extra |= {"channels": dict(channels), "class_scale": class_scale}
+        whole = {"origin": origin, "posterior_scales": scales[0], "_extra_state": extra}
+        result.load_state_dict({**tensors, **whole})
     result.origin = origin.clone()
     return result.requires_grad_(False)
 
@@ -103,4 +112,7 @@ def _in_frame(state: TileState, origin: Tensor) -> TileState:
         for name in ("centers", "means"):
             shift = state["origin"] - origin
             tensors[name] = (tensors[name].double() + shift).to(tensors[name].dtype)
+        if "channel_sums" in tensors:
+            eye = torch.eye(len(shift), dtype=shift.dtype, device=shift.device)
+            tensors["channel_sums"] = moved_sums(tensors["channel_sums"], eye, shift)
     return tensors

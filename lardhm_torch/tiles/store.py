@@ -8,15 +8,24 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Hashable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
 
+from lardhm_torch.channels import CLASS
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.map_files import check_settings, decode_safetensors
+from lardhm_torch.learning.channel_sums import (
+    Layout,
+    conformed,
+    conformed_classes,
+    joint_layout,
+    no_sums,
+    num_rows,
+)
 from lardhm_torch.learning.map_state import PER_MAP
 from lardhm_torch.learning.state_checks import check_values
+from lardhm_torch.learning.state_dicts import channel_shapes, spread_sums
 from lardhm_torch.tiles.entries import Tile
 from lardhm_torch.tiles.indexing import Folder, Index, tile_name, tile_path
 from lardhm_torch.tiles.manifest import Manifest
@@ -66,6 +75,9 @@ class TileStore:
         self.dtype: torch.dtype = getattr(torch, manifest.dtype)
         self._empty = state_of(LardHilbertMap(**manifest.settings).to(self.dtype))
         self._warned: set[Index] = set()
+        columns = num_rows(manifest.channels, manifest.dim) * (1 + manifest.dim)
+        columns += len(manifest.channels.get(CLASS, ()))  # class weights
+        self.bytes_per_cluster = cluster_bytes(manifest.dim, self.dtype) + 8 * columns
 
     def load(self, index: Index) -> TileState:
         """The tensors of a tile; those of an empty map if it is damaged and skipped.
@@ -81,7 +93,7 @@ class TileStore:
             if index not in self._warned:
                 self._warned.add(index)
                 warnings.warn(f"a damaged tile was skipped: {error}", stacklevel=2)
-            state = self._empty
+            state = conformed_state(self._empty, {}, self.manifest.channels)
         return {name: tensor.to(self.device) for name, tensor in state.items()}
 
     def _load(self, index: Index) -> TileState:
@@ -94,17 +106,36 @@ class TileStore:
                     "updated after the map was opened"
                 )
             state, metadata = decode_safetensors(content)
-            self._check(state, metadata, entry, path)
+            extra = json.loads(metadata.get("_extra_state", "null"))
+            self._check(state, extra, entry, path)
+            state = self._with_channels(state, extra)
         except (OSError, ValueError) as error:
             raise DamagedTileError(index, str(error)) from error
         return state
 
-    def _check(self, state: TileState, metadata: dict[str, str], entry: Tile, path: Path) -> None:
+    def _with_channels(self, state: TileState, extra: dict[str, Any]) -> TileState:
+        """The tensors with the channels of the manifest; a ValueError for channels that it has not."""
+        count = len(state["weights"])
+        given: dict[str, Any] = {**state, "_extra_state": extra}
+        spread_sums(given, "", count)
+        layout, shapes = channel_shapes(given, "", self.manifest.dim)
+        for name, shape in shapes.items():
+            if given[name].shape != (count, *shape):
+                raise ValueError(
+                    f"{name} must be {(count, *shape)}; got {tuple(given[name].shape)}"
+                )
+        check_values({name: given[name] for name in shapes})
+        known = self.manifest.channels
+        if set(joint_layout(known, layout)) != set(known) or not _has_classes(known, layout):
+            raise ValueError(f"channels must be those of the manifest, {known}; got {layout}")
+        return conformed_state({**state, **{name: given[name] for name in shapes}}, layout, known)
+
+    def _check(self, state: TileState, extra: Any, entry: Tile, path: Path) -> None:
         """A ValueError unless settings, dtypes and shapes are those of the manifest."""
         missing = [name for name in self._empty if name not in state]
         if missing:
             raise ValueError(f"{path} must hold the tensors of a map; missing: {missing}")
-        settings = check_settings(json.loads(metadata.get("_extra_state", "null")))
+        settings = check_settings(extra)
         found = {"dtype": state["centers"].dtype, "num_clusters": len(state["centers"])}
         wanted = {"dtype": self.dtype, "num_clusters": entry.num_clusters}
         found, wanted = {**settings, **found}, {**self.manifest.settings, **wanted}
@@ -121,6 +152,24 @@ class TileStore:
         check_values({name: state[name] for name in self._empty})
 
 
+def _has_classes(known: Layout, layout: Layout) -> bool:
+    """Whether all classes of the second layout are in the first."""
+    return set(layout.get(CLASS, ())) <= set(known.get(CLASS, ()))
+
+
+def conformed_state(state: TileState, before: Layout, after: Layout) -> TileState:
+    """The tensors of a map with the channels of a layout that has all of theirs; others are 0."""
+    if not after:
+        return state
+    sums = state.get("channel_sums", no_sums(state["centers"], before))
+    state = {**state, "channel_sums": conformed(sums, before, after)}
+    if CLASS in after:
+        none = state["centers"].new_zeros(len(sums), len(before.get(CLASS, ())))
+        weights = state.get("class_weights", none)
+        state["class_weights"] = conformed_classes(weights, before, after)
+    return state
+
+
 class Cache:
     """Maps and tiles by key, up to a number of bytes.
 
@@ -128,8 +177,8 @@ class Cache:
     that were made of them; among tiles and among maps, the least recently used are dropped first.
     """
 
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
+    def __init__(self, limit: int, bytes_per_cluster: int) -> None:
+        self.limit, self.bytes_per_cluster = limit, bytes_per_cluster
         self.num_bytes = 0
         self._tiles: Entries[TileState] = OrderedDict()
         self._maps: Entries[LardHilbertMap] = OrderedDict()
@@ -151,14 +200,14 @@ class Cache:
 
     def put_tile(self, key: Hashable, state: TileState) -> None:
         """Keep a tile, unless it is larger than the limit."""
-        self._put(self._tiles, key, state, state["centers"])
+        self._put(self._tiles, key, state, len(state["centers"]))
 
     def put_map(self, key: Hashable, model: LardHilbertMap) -> None:
         """Keep a map, unless it is larger than the limit."""
-        self._put(self._maps, key, model, model.centers)
+        self._put(self._maps, key, model, len(model))
 
-    def _put(self, entries: Entries[Value], key: Hashable, value: Value, centers: Tensor) -> None:
-        num_bytes = cluster_bytes(centers.shape[1], centers.dtype) * len(centers)
+    def _put(self, entries: Entries[Value], key: Hashable, value: Value, clusters: int) -> None:
+        num_bytes = self.bytes_per_cluster * clusters
         self.make_room(num_bytes)
         if num_bytes <= self.limit:
             entries[key] = (value, num_bytes)

@@ -9,9 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lardhm_torch.channels import CLASS
 from lardhm_torch.hilbert_map import LardHilbertMap
 from lardhm_torch.io.packed_files import is_packed
-from lardhm_torch.learning import posterior
+from lardhm_torch.learning import channel_queries, posterior
+from lardhm_torch.learning.channel_queries import ChannelSums
+from lardhm_torch.learning.channel_sums import Layout
 from lardhm_torch.learning.points import check_axes, check_points
 from lardhm_torch.tiles.blocks import lattice_parts, row_numbers, rows_by_number
 from lardhm_torch.tiles.indexing import Folder
@@ -120,7 +123,7 @@ class TiledMap:
             edge: edge length of a tile [m].
 
         Raises:
-            ValueError: the map is empty or has channels, or edge is not > 0.
+            ValueError: the map is empty, or edge is not > 0.
             FileExistsError: the folder holds a tiled map already.
         """
         split_map(model, folder, edge)
@@ -164,6 +167,43 @@ class TiledMap:
     def bayesian_probability(self, points: Tensor) -> Tensor:
         """`LardHilbertMap.bayesian_probability`, if the map that was split has a posterior."""
         return self._ask(points, lambda model, part: model.bayesian_probability(part), 0.5)
+
+    @property
+    def channel_layout(self) -> Layout:
+        """Names of the channels, with what each has (`channel_sums`)."""
+        return dict(self.manifest.channels)
+
+    @property
+    def channels(self) -> dict[str, ChannelSums]:
+        """`LardHilbertMap.channels` of the whole map, if that fits the memory limit."""
+        return self._local.whole().channels
+
+    @property
+    def classes(self) -> list[int]:
+        """`LardHilbertMap.classes`."""
+        return list(self.channel_layout.get(CLASS, ()))
+
+    def channel(self, points: Tensor, name: str) -> Tensor:
+        """`LardHilbertMap.channel`."""
+        if name == CLASS:
+            return self.class_probability(points)
+        size = channel_queries.layout_entry(self.channel_layout, name)
+        unknown = torch.full((size,) if size else (), torch.nan)
+        return self._ask(points, lambda model, part: model.channel(part, name), unknown)
+
+    def class_log_odds(self, points: Tensor) -> Tensor:
+        """`LardHilbertMap.class_log_odds`."""
+        classes = channel_queries.layout_entry(self.channel_layout, CLASS)
+        unknown = channel_queries.prior_log_odds(len(classes), self.manifest.class_scale)
+        return self._ask(points, lambda model, part: model.class_log_odds(part), unknown)
+
+    def class_probability(self, points: Tensor) -> Tensor:
+        """`LardHilbertMap.class_probability`."""
+        return torch.softmax(self.class_log_odds(points), dim=-1)
+
+    def class_posterior(self, points: Tensor) -> Tensor:
+        """`LardHilbertMap.class_posterior`."""
+        return channel_queries.joint_posterior(self(points), self.class_probability(points))
 
     @torch.no_grad()
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
@@ -241,13 +281,17 @@ class TiledMap:
             yield rows.to(self.origin.device), self._local.of_box(*box)
 
     def _ask(
-        self, points: Tensor, answer: Callable[[LardHilbertMap, Tensor], Tensor], unknown: float
+        self,
+        points: Tensor,
+        answer: Callable[[LardHilbertMap, Tensor], Tensor],
+        unknown: float | Tensor,
     ) -> Tensor:
         """Answers of the blocks' maps at (..., D) points; ``unknown`` where no tile contributes."""
+        unknown = torch.as_tensor(unknown, dtype=self._dtype, device=self.origin.device)
         points = torch.as_tensor(points, device=self.origin.device)
         check_points(points, self.dim)
         flat = points.reshape(-1, self.dim)
-        result = torch.full((len(flat),), unknown, dtype=self._dtype, device=flat.device)
+        result = unknown.expand(len(flat), *unknown.shape).clone()
         keeps_graph = torch.is_grad_enabled() and flat.requires_grad
         groups, answers = [], []
         for number, rows in self._rows_by_block(flat.detach(), result):
@@ -261,12 +305,11 @@ class TiledMap:
             else:
                 result[rows] = answer(model, part)
         if keeps_graph:  # a single node of the graph, independent of the number of blocks
-            result = result + 0.0 * torch.nan_to_num(flat, 0.0, 0.0, 0.0).sum(dim=1).to(
-                result.dtype
-            )
+            zero = 0.0 * torch.nan_to_num(flat, 0.0, 0.0, 0.0).sum(dim=1).to(result.dtype)
+            result = result + zero.reshape(-1, *[1] * unknown.ndim)
             if groups:
                 result = result.index_copy(0, torch.cat(groups), torch.cat(answers))
-        return result.reshape(points.shape[:-1])
+        return result.reshape(*points.shape[:-1], *unknown.shape)
 
     def _rows_by_block(self, flat: Tensor, result: Tensor) -> Iterator[tuple[int, slice | Tensor]]:
         """Number of each block in which a tile contributes, and the rows of its points.

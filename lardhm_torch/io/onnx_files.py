@@ -1,0 +1,89 @@
+"""Maps as ONNX models, for runtimes other than PyTorch."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import warnings
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from lardhm_torch import features
+from lardhm_torch.io.atomic_files import replaced_file
+from lardhm_torch.learning.map_tensors import at_least_float32
+
+if TYPE_CHECKING:
+    from lardhm_torch.hilbert_map import LardHilbertMap
+
+OPSET = 18
+LIBRARIES = ("onnx", "onnxscript")
+
+
+class PlainMap(nn.Module):
+    """The definition of a map in operations that ONNX has: an exhaustive search for the neighbors."""
+
+    origin: Tensor
+    centers: Tensor
+    scale_tril: Tensor
+    weights: Tensor
+
+    def __init__(self, model: LardHilbertMap) -> None:
+        super().__init__()
+        centers = at_least_float32(model.centers.detach())
+        self.register_buffer("origin", model.origin.double())
+        self.register_buffer("centers", centers)
+        self.register_buffer("scale_tril", model.scale_tril.detach().to(centers.dtype))
+        self.register_buffer("weights", model.weights.detach().to(centers.dtype))
+        self.num_neighbors = min(model.num_neighbors, len(model))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """(N, D) world positions [m], float64 -> (N,) probability; NaN where points are not finite."""
+        local = (points - self.origin).to(self.centers.dtype)
+        squared = features.squared_distances(local[:, None], self.centers[None])
+        indices = squared.topk(self.num_neighbors, dim=1, largest=False).indices
+        values = features.lard_kernel(local, self.centers, self.scale_tril, indices)
+        values = values * features.neighbor_fade(local, self.centers, indices)
+        return torch.sigmoid((values * self.weights[indices]).sum(dim=1) + 0 * local.sum(dim=1))
+
+
+def save_onnx(model: LardHilbertMap, path: str | os.PathLike[str]) -> None:
+    """Write what `model(points)` computes as an ONNX model of opset 18.
+
+    Its input ``points`` (N, D) has world positions [m] in float64, for any N from 1 on. Its output
+    ``probability`` (N,) has the dtype of the map, float32 at least. The model holds no search index:
+    it computes the distance from every point to every cluster, so time and memory grow with N times
+    the number of clusters. Channels, classes and the posterior of the weights are not exported.
+
+    Args:
+        model: a map with at least one cluster.
+        path: the file; an old one is replaced.
+
+    Raises:
+        ImportError: the libraries onnx and onnxscript are not installed.
+        ValueError: the map is empty.
+    """
+    if missing := [name for name in LIBRARIES if importlib.util.find_spec(name) is None]:
+        raise ImportError(
+            f"ONNX models need {' and '.join(missing)}, which is not installed; "
+            'install the extra: pip install "lardhm_torch[onnx]"'
+        )
+    if len(model) == 0:
+        raise ValueError("model must have at least one cluster to be exported; this map is empty")
+    example = model.origin.detach().cpu().double().repeat(3, 1)
+    plain = PlainMap(model).eval().cpu()
+    with warnings.catch_warnings(), replaced_file(path) as partial:
+        warnings.simplefilter("ignore")  # of the exporter's own dependencies
+        program = torch.onnx.export(
+            plain,
+            (example,),
+            input_names=["points"],
+            output_names=["probability"],
+            dynamic_shapes=({0: torch.export.Dim("count", min=1)},),
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+        assert program is not None
+        program.save(partial)
