@@ -25,7 +25,6 @@ from timing import format_rows
 from tqdm import tqdm
 
 from lardhm_torch import (
-    FitConfig,
     LardHilbertMap,
     Scans,
     StreamConfig,
@@ -37,8 +36,6 @@ from lardhm_torch import (
 )
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.io.octrees import new_tree, to_array
-from lardhm_torch.learning.clustering import cluster_each, split_labels
-from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.streaming import real_time
 
 SETS = (
@@ -68,17 +65,10 @@ def streamed(scans: Iterable[Scans], config: StreamConfig) -> LardHilbertMap:
     return model
 
 
-def batch_map(train: Scans, occupied: int, free: int) -> LardHilbertMap:
-    """All scans at once, with a given number of clusters of each class."""
-    samples, rng = sample_rays(train), torch.Generator().manual_seed(0)
-    model = LardHilbertMap()
-    origin = samples.points.mean(dim=0).round()
-    local = (samples.points - origin).float()
-    local, labels = in_morton_order(local, samples.labels)
-    clusters = cluster_each(split_labels(local, labels)[:2], (occupied, free), rng)
-    model._grow(*clusters, origin)
-    model._train_weights(local, labels, FitConfig(), rng, False)
-    return model
+def batch_map(train: Scans, num_clusters: int) -> LardHilbertMap:
+    """All scans at once, with a given number of clusters."""
+    samples = sample_rays(train)
+    return LardHilbertMap().fit(samples.points, samples.labels, num_clusters)
 
 
 def accuracy(arguments: argparse.Namespace) -> list[Row]:
@@ -97,7 +87,7 @@ def accuracy(arguments: argparse.Namespace) -> list[Row]:
         for order, stream in orders.items():
             model = streamed(stream, StreamConfig())
             occupied = int(model.is_occupied.sum())
-            batch = batch_map(train, occupied, len(model) - occupied)
+            batch = batch_map(train, len(model))
             ours, theirs = evaluate(model, test), evaluate(batch, test)
             row: Row = {"set": name, "scans": len(scans), "order": order}
             row["clusters"] = f"{occupied} + {len(model) - occupied}"
@@ -196,7 +186,8 @@ def speed_of(data: Path, name: str) -> list[Row]:
             scan, sampling = scans[0], settings[system].sampling
             kept = settings[system].max_rays or len(scan)
             part = scan.select(torch.arange(min(kept, len(scan))))
-            row["samples"] = len(sample_rays(part, sampling))
+            limit = settings[system].update.max_points
+            row["samples"] = len(sample_rays(part, sampling, max_points=limit))
         rows.append(row)
     return rows
 

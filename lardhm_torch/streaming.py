@@ -68,7 +68,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
     return replace(
         config,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(config.update, max_points=8_000, max_trained=4_000),
+        update=replace(config.update, max_points=10_000, max_trained=3_000),
     )
 
 

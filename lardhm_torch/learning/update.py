@@ -48,7 +48,7 @@ class UpdateConfig:
     zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
     split_loss: float = 0.01  # clusters whose points have a larger mean loss are divided
     max_points: int = 20_000  # new points of each class that are used; more are drawn at random
-    max_trained: int = 20_000  # changed clusters that are trained; the others follow later
+    max_trained: int = 8_000  # changed clusters that are trained; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
