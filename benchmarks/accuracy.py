@@ -54,15 +54,11 @@ def lard_hilbert_map(train: Scans, seed: int) -> Model:
 
 @torch.enable_grad()
 def tuned_hilbert_map(train: Scans, seed: int) -> Model:
-    """A map of as many clusters as its points allow, fine-tuned, as by ``lardhm fit --tune``."""
+    """A fine-tuned map, as by ``lardhm fit --tune``."""
     from lardhm_torch import fine_tune
-    from lardhm_torch.learning.fitting import FitConfig
 
     samples = sample_rays(train, seed=seed)
-    start = FitConfig(shape_passes=0)
-    model = LardHilbertMap(dim=train.dim).fit(
-        samples.points, samples.labels, seed=seed, config=start
-    )
+    model = LardHilbertMap(dim=train.dim).fit(samples.points, samples.labels, seed=seed)
     fine_tune(
         model,
         samples.points,

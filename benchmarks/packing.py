@@ -35,6 +35,7 @@ from lardhm_torch import (
 )
 from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
+from lardhm_torch.learning.sized_maps import SMALL
 
 Row = dict[str, Any]
 FRAME_RAYS = 8_000  # training rays of a frame, at most
@@ -60,7 +61,10 @@ def set_rows(name: str, path: Path, folder: Path, arguments: argparse.Namespace)
     rows, whole = [], None
     for fraction in arguments.fractions:
         wanted = None if whole is None else max(2, round(fraction * whole))
-        model = LardHilbertMap().fit(samples.points, samples.labels, wanted, seed=seed)
+        config = SMALL if arguments.small else None
+        model = LardHilbertMap().fit(
+            samples.points, samples.labels, wanted, seed=seed, config=config
+        )
         whole = whole or len(model)
         if arguments.tune:
             with torch.enable_grad():
@@ -146,6 +150,7 @@ def parse_arguments() -> argparse.Namespace:
         "--fractions", type=float, nargs="+", default=[1.0], help="of the default clusters"
     )
     parser.add_argument("--tune", action="store_true", help="fine-tune the maps")
+    parser.add_argument("--small", action="store_true", help="clusters with trained shapes")
     parser.add_argument("--stream", help="name of the folder of a stream")
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "packing.json")

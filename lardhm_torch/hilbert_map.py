@@ -26,12 +26,12 @@ from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.map_state import HISTORY
 from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.scene_clusters import fit_scene
-from lardhm_torch.learning.sized_maps import fit_size
+from lardhm_torch.learning.sized_maps import SMALL, fit_size
 from lardhm_torch.learning.state_dicts import occupied_sums
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.sampling import seeded_generator
+from lardhm_torch.scans import seeded_generator
 
 
 class LardHilbertMap(MapQueries):
@@ -88,22 +88,23 @@ class LardHilbertMap(MapQueries):
         """Fit the map to labelled points. Existing clusters are discarded.
 
         Each class is clustered separately. The moments of the clusters determine centers and
-        length-scales, and then the weights are trained. Unless the number of clusters is given, the
-        scene determines it, and centers and length-scales are trained, too (`scene_clusters`). If
-        anything fails, the map is unchanged.
+        length-scales, and then the weights are trained. With ``max_bytes`` or
+        ``FitConfig(shape_passes=4)`` centers and length-scales of fewer clusters are trained, too
+        (`scene_clusters`). If anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
             num_clusters: total over both classes, half each; a class too small for its half
-                leaves the remainder to the other. None: as many as the scene needs.
+                leaves the remainder to the other. None: chosen from the data
+                (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
             seed: random seed of clustering and training.
             max_bytes: instead of a number of clusters, the size of the file that `pack` writes: the map
                 gets as many clusters as fit into it.
             channels: values of the points by name, such as `Samples.channels`; those of the occupied
                 points are summed up in the clusters. They do not change the occupancy.
             progress: show a progress bar on a terminal.
-            config: training settings of the weights.
+            config: training settings.
 
         Returns:
             This map.
@@ -122,7 +123,8 @@ class LardHilbertMap(MapQueries):
         if max_bytes is not None and num_clusters is not None:
             raise ValueError("num_clusters and max_bytes exclude each other; got both")
         rng = seeded_generator(seed, "fit", self.centers.device)
-        task = FitTask(self.kernel, config or FitConfig(), rng, progress)
+        config = config or (FitConfig() if max_bytes is None else SMALL)
+        task = FitTask(self.kernel, config, rng, progress)
         finish = partial(channel_sums.fitted, channels=channels, points=points, labels=labels)
         if max_bytes is None:
             state = fit_scene(samples.points, samples.labels, num_clusters, task)
@@ -267,9 +269,8 @@ class LardHilbertMap(MapQueries):
         channels: Channels | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
-        """Update the map with one more scan, without forgetting.
+        """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
 
-        On an empty map this is `fit` with ``FitConfig(shape_passes=0)``.
         Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
         near them are regrouped, and the weights there are trained on the kept points. Parameters
         remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
@@ -298,10 +299,7 @@ class LardHilbertMap(MapQueries):
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
-            start = FitConfig(shape_passes=0)  # later scans divide the clusters where they must
-            return self.fit(
-                points, labels, num_clusters, seed=seed, channels=channels, config=start
-            )
+            return self.fit(points, labels, num_clusters, seed=seed, channels=channels)
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)

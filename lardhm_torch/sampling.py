@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
 from lardhm_torch.native.crossings import Lines, never_crossed, passages
-from lardhm_torch.scans import Scans
+from lardhm_torch.scans import Scans, seeded_generator
 
 UNKNOWN = 0.5  # label of points in unobserved space
 LOST = 0.5  # of the hits outside the range limits: more than that is a mistake of units
@@ -393,25 +392,3 @@ def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) 
     place = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.double)
     place += torch.arange(count, device=rng.device)
     return (place * (num_points / count)).long().clamp_(max=num_points - 1)
-
-
-def seeded_generator(
-    seed: int, purpose: str, device: torch.device | str = "cpu"
-) -> torch.Generator:
-    """A generator whose numbers depend on the seed and on what they are for.
-
-    Sampling, clustering and training with the same seed must not draw the same numbers: points
-    would be placed and chosen by one sequence.
-
-    Args:
-        seed: any integer.
-        purpose: name of the stream, for example "sampling".
-        device: where the numbers are drawn.
-
-    Raises:
-        ValueError: seed is not an integer.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int):
-        raise ValueError(f"seed must be an integer; got {seed!r}")
-    digest = hashlib.blake2b(f"{purpose} {seed}".encode(), digest_size=8).digest()
-    return torch.Generator(device=device).manual_seed(int.from_bytes(digest, "little") >> 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -219,3 +220,25 @@ def split_rays(scans: Scans, ratio: float = 0.5, seed: int = 0) -> tuple[Scans, 
     order = torch.randperm(len(scans), generator=rng).to(scans.ends.device)
     cut = round(ratio * len(scans))
     return scans.select(order[:cut].sort().values), scans.select(order[cut:].sort().values)
+
+
+def seeded_generator(
+    seed: int, purpose: str, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """A generator whose numbers depend on the seed and on what they are for.
+
+    Sampling, clustering and training with the same seed must not draw the same numbers: points
+    would be placed and chosen by one sequence.
+
+    Args:
+        seed: any integer.
+        purpose: name of the stream, for example "sampling".
+        device: where the numbers are drawn.
+
+    Raises:
+        ValueError: seed is not an integer.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int):
+        raise ValueError(f"seed must be an integer; got {seed!r}")
+    digest = hashlib.blake2b(f"{purpose} {seed}".encode(), digest_size=8).digest()
+    return torch.Generator(device=device).manual_seed(int.from_bytes(digest, "little") >> 1)

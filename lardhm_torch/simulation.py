@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.channels import CLASS, COLOR
-from lardhm_torch.sampling import seeded_generator
-from lardhm_torch.scans import Scans
+from lardhm_torch.scans import Scans, seeded_generator
 
 if TYPE_CHECKING:
     import trimesh

@@ -21,14 +21,8 @@ from lardhm_torch.io.atomic_files import remove_partials, replaced_file
 from lardhm_torch.learning import packing
 from lardhm_torch.learning.clustering import scan_clusters, split_labels
 from lardhm_torch.learning.update import UpdateConfig
-from lardhm_torch.sampling import (
-    NoUsableRayError,
-    Samples,
-    SamplingConfig,
-    sample_rays,
-    seeded_generator,
-)
-from lardhm_torch.scans import Scans
+from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
+from lardhm_torch.scans import Scans, seeded_generator
 
 
 @dataclass(frozen=True, kw_only=True)

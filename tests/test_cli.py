@@ -193,14 +193,15 @@ def test_fit_takes_settings(folder):
     assert 50 <= len(model) <= 60
 
 
-def test_fit_makes_a_map_of_a_size_and_one_without_trained_shapes(folder):
+def test_fit_makes_a_map_of_a_size_and_one_with_trained_shapes(folder):
     run("fit", folder / "train.npz", "--size", "2kB", "-o", folder / "sized.pt")
     run("pack", folder / "sized.pt", "-o", folder / "sized.lhm")
     assert 1700 < (folder / "sized.lhm").stat().st_size <= 2000
-    run("fit", folder / "train.npz", "--fast", "-o", folder / "fast.pt")
-    fast = LardHilbertMap.load(folder / "fast.pt")
-    assert torch.equal(fast.centers, fast.means)
-    assert len(fast) > len(LardHilbertMap.load(folder / "map.pt"))
+    run("fit", folder / "train.npz", "--small", "-o", folder / "trained.pt")
+    small, default = (LardHilbertMap.load(folder / name) for name in ("trained.pt", "map.pt"))
+    assert torch.equal(default.centers, default.means)
+    assert not torch.allclose(small.centers, small.means)
+    assert len(small) < len(default)
 
 
 def test_flat_scans_make_a_two_dimensional_map_on_request(tmp_path):
@@ -339,7 +340,7 @@ def test_what_are_no_scans_is_an_error_of_one_line(bad, monkeypatch, capsys, com
         ("fit scans.npz -o o.pt --size 100B", "max_bytes must be a whole number"),
         ("fit scans.npz -o o.pt --size 2kB --clusters 9", "exclude each other"),
         ("fit scans.npz -o o.pt --size 2kB --tune", "--size cannot be used with --tune"),
-        ("fit scans.npz -o o.pt --fast --incremental", "cannot be used with --incremental"),
+        ("fit scans.npz -o o.pt --small --incremental", "cannot be used with --incremental"),
         ("fit scans.npz -o o.pt --neighbors 0", "num_neighbors must be"),
         ("fit scans.npz -o o.pt --dim 0", "0 coordinates; got 3"),
         ("fit scans.npz -o o.pt --resume", "need --incremental"),

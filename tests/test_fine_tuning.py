@@ -6,7 +6,7 @@ import torch
 from lardhm_torch import FitConfig, LardHilbertMap, Samples, TuneConfig, fine_tune
 from lardhm_torch.io.map_files import load_state, save_state
 from lardhm_torch.learning.fine_tuning import _check, _hold_out
-from lardhm_torch.sampling import seeded_generator
+from lardhm_torch.scans import seeded_generator
 
 F64 = torch.float64
 

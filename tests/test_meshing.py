@@ -10,7 +10,6 @@ from torch import nn
 
 from lardhm_torch import LardHilbertMap, grid, sample_rays, simulate_room, split_rays
 from lardhm_torch.evaluation.mesh_distances import mesh_metrics
-from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.simulation import room_mesh
 from lardhm_torch.surfaces import following, meshing, ridge
 from lardhm_torch.surfaces.following import Sheet
@@ -313,8 +312,7 @@ def facing_away(mesh, truth):
 def test_the_mesh_of_a_room_lies_on_its_walls():
     train, _ = split_rays(simulate_room(seed=1), ratio=0.8, seed=1)
     samples = sample_rays(train, seed=1)
-    fine = FitConfig(shape_passes=0)  # learned clusters are too large for the corners: 136 m^2
-    model = LardHilbertMap().fit(samples.points, samples.labels, seed=1, config=fine)
+    model = LardHilbertMap().fit(samples.points, samples.labels, seed=1)
     meshes = {
         surface: extract_mesh(model, 0.05, surface=surface) for surface in ("peak", "crossing")
     }

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from lardhm_torch.sampling import SamplingConfig, sample_rays, seeded_generator
-from lardhm_torch.scans import Scans, split_rays
+from lardhm_torch.sampling import SamplingConfig, sample_rays
+from lardhm_torch.scans import Scans, seeded_generator, split_rays
 
 
 def random_scans(rays=200, seed=0, **columns):

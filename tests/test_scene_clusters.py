@@ -15,12 +15,15 @@ from lardhm_torch.learning.scene_clusters import (
     known_loss,
     needed_clusters,
 )
+from lardhm_torch.learning.sized_maps import SMALL
 
 KERNEL = Kernel(16, 2.5, 0.01)
 
 
-def task(seed=0, **settings):
-    return FitTask(KERNEL, FitConfig(**settings), torch.Generator().manual_seed(seed))
+def task(seed=0, shape_passes=4):
+    return FitTask(
+        KERNEL, FitConfig(shape_passes=shape_passes), torch.Generator().manual_seed(seed)
+    )
 
 
 def striped(stripes, count=20_000, seed=0):
@@ -104,13 +107,13 @@ def test_chunks_of_points_are_trained_one_after_the_other(monkeypatch):
 
 def test_the_same_seed_gives_the_same_map():
     points, labels = striped(2)
-    one, other = (LardHilbertMap().fit(points, labels, seed=3) for _ in range(2))
+    one, other = (LardHilbertMap().fit(points, labels, seed=3, config=SMALL) for _ in range(2))
     assert torch.equal(one.weights, other.weights)
     assert torch.equal(one.raw_scale_tril, other.raw_scale_tril)
 
 
 def test_a_2d_map_learns_its_number_of_clusters_too():
     points, labels = striped(2)
-    model = LardHilbertMap(dim=2).fit(points[:, :2], labels)
+    model = LardHilbertMap(dim=2).fit(points[:, :2], labels, config=SMALL)
     right = (model(points[:, :2]) > 0.5) == (labels > 0.5)
     assert float(right.double().mean()) > 0.97

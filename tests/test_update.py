@@ -19,7 +19,6 @@ from lardhm_torch import (
 from lardhm_torch.learning import parameters
 from lardhm_torch.learning.clustering import cluster_points
 from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
-from lardhm_torch.learning.fitting import FitConfig
 from lardhm_torch.learning.forgetting import DOUBT, GONE, OVERRULED, doubted, forget, trust
 from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.learning.regrouping import Rule, _divide
@@ -419,8 +418,7 @@ def test_revisits_make_hardly_more_clusters_than_all_rays_at_once(data, name):
         samples = sample_rays(scans.select(rays), seed=number)
         model.update(samples.points, samples.labels, seed=number)
     samples = sample_rays(scans.select(order))
-    of_points = FitConfig(shape_passes=0)  # updates choose the number from the points, too
-    whole = LardHilbertMap().fit(samples.points, samples.labels, config=of_points)
+    whole = LardHilbertMap().fit(samples.points, samples.labels)
     assert len(model) <= 1.5 * len(whole)
 
 

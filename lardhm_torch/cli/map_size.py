@@ -10,13 +10,12 @@ UNITS = {"": 1, "B": 1, "kB": 1000, "MB": 1000**2, "KiB": 1024, "MiB": 1024**2}
 
 
 def add_map_size(sub: argparse.ArgumentParser) -> None:
-    """Add ``--clusters``, ``--size`` and ``--fast``."""
+    """Add ``--clusters``, ``--size`` and ``--small``."""
     sub.add_argument(
         "--clusters",
         type=int,
         metavar="N",
-        help="total number of clusters; centers and length scales are not trained (default: as many "
-        "as the scene needs)",
+        help="total number of clusters (default: chosen from the points)",
     )
     sub.add_argument(
         "--size",
@@ -25,9 +24,10 @@ def add_map_size(sub: argparse.ArgumentParser) -> None:
         help="as many clusters as fit into a file of this size when the map is packed, such as 20kB",
     )
     sub.add_argument(
-        "--fast",
+        "--small",
         action="store_true",
-        help="choose the number of clusters from the points alone, and train only the weights",
+        help="about a third of the clusters, as many as the scene needs, with trained shapes: as good "
+        "at points, less exact in ranges and meshes",
     )
 
 
@@ -44,20 +44,25 @@ def size_in_bytes(text: str) -> int:
 def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """Keyword arguments of `LardHilbertMap.fit`.
 
-    Fine-tuning trains the shapes itself, and gains from more clusters than a scene needs.
+    Raises:
+        ValueError: arguments exclude each other.
     """
-    from lardhm_torch.learning.fitting import FitConfig
+    from lardhm_torch.learning.sized_maps import SMALL
 
     is_tuned = bool(arguments.tune or arguments.tune_state)
-    if is_tuned and arguments.size is not None:
-        raise ValueError("--size cannot be used with --tune, which would change the size")
+    if is_tuned and (arguments.size is not None or arguments.small):
+        raise ValueError(
+            "--size and --small cannot be used with --tune, which trains shapes itself"
+        )
+    if arguments.small and arguments.clusters is not None:
+        raise ValueError("--small cannot be used with --clusters; it chooses the number")
     settings: dict[str, Any] = {"num_clusters": arguments.clusters, "max_bytes": arguments.size}
-    if arguments.fast or is_tuned:
-        settings["config"] = FitConfig(shape_passes=0)
+    if arguments.small:
+        settings["config"] = SMALL
     return settings
 
 
 def check_not_incremental(arguments: argparse.Namespace) -> None:
     """Raise a ValueError if an argument is given that a fit of single scans does not have."""
-    if arguments.size is not None or arguments.fast:
-        raise ValueError("--size and --fast cannot be used with --incremental")
+    if arguments.size is not None or arguments.small:
+        raise ValueError("--size and --small cannot be used with --incremental")

@@ -29,7 +29,8 @@ from lardhm_torch.learning.tuning_steps import (
     to_rows,
     tuning_steps,
 )
-from lardhm_torch.sampling import UNKNOWN, Samples, seeded_generator
+from lardhm_torch.sampling import UNKNOWN, Samples
+from lardhm_torch.scans import seeded_generator
 
 MAX_BATCH = 1 << 15  # upper bound on the default batch size
 GROUP_ROWS = 1 << 21  # number of points whose neighbors are in memory at a time

@@ -45,9 +45,10 @@ class FitConfig:
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # loss of unknown points, relative to all others
-    # Passes that train centers and length-scales, too, where the number of clusters is learned
-    # (`scene_clusters`); 0: the number is chosen from the points alone, and the weights are trained.
-    shape_passes: int = 4
+    # 0: the number of clusters is chosen from the points, and the weights are trained. 4: the scene
+    # decides on the number (`scene_clusters`), and so many passes train centers and length-scales, too.
+    # A third of the clusters then answers points as well, but ranges and meshes are less exact.
+    shape_passes: int = 0
 
     def rows_per_batch(self, num_points: int) -> int:
         """Points per step: about ``batch_size``, with equally large batches in each pass."""

@@ -21,7 +21,7 @@ from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
 from lardhm_torch.learning.retraining import balanced, evidence_weights, trained
-from lardhm_torch.sampling import seeded_generator
+from lardhm_torch.scans import seeded_generator
 
 AnyMap = TypeVar("AnyMap", bound=MapParameters)
 

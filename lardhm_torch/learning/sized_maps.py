@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lardhm_torch.learning.channel_sums import Layout
-from lardhm_torch.learning.fitting import FitTask, fit_clusters
+from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_clusters
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.packing import packed_bytes
 from lardhm_torch.learning.parameters import MapParameters, write_state
 from lardhm_torch.learning.points import TrainingPoints
 from lardhm_torch.learning.scene_clusters import fit_shapes, is_learnable
 
+SMALL = FitConfig(shape_passes=4)  # of maps with few clusters
 HEADER_BYTES, CLUSTER_BYTES = 140, 14  # of a packed file in 3-D, about
 SMALLEST = 256  # bytes that can be asked for: a few clusters
 FULL = 0.95  # a file of so much of the size is large enough
