@@ -68,14 +68,14 @@ test: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	@$(BIN)/python -c "from lardhm_torch import native; native.available()"  # compile the kernel once
-	$(BIN)/python -m pytest $(PARALLEL) $(LONG:%=--deselect %)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) $(LONG:%=--deselect %)
 
 check: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	@$(BIN)/python -c "from lardhm_torch import native; native.available()"
-	$(BIN)/python -m pytest $(PARALLEL) $(QUICK:%=tests/test_%.py)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) $(QUICK:%=tests/test_%.py)
 
 wheel: .venv/wheel
 	$(BIN)/python scripts/wheels/build_wheels.py $(WHEELS)

@@ -212,7 +212,7 @@ def sample_rays(
     begin = len(hits)
     for members, depths in groups:  # written in place: on a full scan a million points
         rows = slice(begin, begin := begin + depths.numel())
-        of_rays = _taken if limits[0] is None else _chosen
+        of_rays = _taken if limits[0] is None else Tensor.__getitem__
         start = starts if scans.num_scans == 1 else of_rays(starts, members)
         along, block = of_rays(ahead, members), points[rows].view(*depths.shape, scans.dim)
         for axis in range(scans.dim):  # three times as fast as all axes at once
@@ -224,11 +224,8 @@ def sample_rays(
     known = Samples(points, labels, ray_id, dropped)
     channels = select_channels(scans.channels, hit_rays)
     seen = _rows(first)
-    lines = Lines(
-        starts if len(starts) == 1 else _taken(starts, seen),
-        _taken(ahead, seen),
-        _taken(free_end, seen),
-    )
+    from_there = starts if len(starts) == 1 else _taken(starts, seen)
+    lines = Lines(from_there, _taken(ahead, seen), _taken(free_end, seen))
     samples = known
     if config.passing_samples:
         whole = lines._replace(reach=_taken(reach, seen))
@@ -236,6 +233,8 @@ def sample_rays(
         samples = _with_passing(
             samples, len(hits), whole, lines.reach, _taken(rays, seen), config, passing
         )
+        if max_points is not None:
+            samples = _thinned(samples, len(hits), max_points, passing)
     if config.behind_samples:
         samples = _with_unknown(samples, _taken(ahead, hits), lines, config, rng)
     return _with_channels(samples, channels)
@@ -272,6 +271,17 @@ def _with_passing(
         points=torch.cat([known.points, starts + depths[:, None] * lines.ahead[rays]]),
         labels=torch.cat([known.labels, known.labels.new_zeros(len(rays))]),
         ray_id=torch.cat([known.ray_id, ray_id[rays]]),
+    )
+
+
+def _thinned(samples: Samples, num_hits: int, limit: int, rng: torch.Generator) -> Samples:
+    """All hits and at most ``limit`` of the free points after them: a stratified random subset."""
+    if (free := len(samples) - num_hits) <= limit:
+        return samples
+    kept = num_hits + spread_rows(free, limit, rng)
+    rows = torch.cat([torch.arange(num_hits, device=kept.device), kept])
+    return Samples(
+        samples.points[rows], samples.labels[rows], samples.ray_id[rows], samples.dropped
     )
 
 
@@ -345,7 +355,7 @@ def _stratified_depths(
     shape = (len(members), stretches.shape[1])
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
     depths += stretches
-    return members, depths.mul_((_chosen(free_end, members) / count)[:, None])
+    return members, depths.mul_((free_end[members] / count)[:, None])
 
 
 def _near_depths(
@@ -355,7 +365,7 @@ def _near_depths(
     members, stretches = _stretches(rays, config.near_samples, limit, rng)
     shape = (len(members), stretches.shape[1])
     depths = torch.rand(shape, generator=rng, device=rng.device, dtype=free_end.dtype)
-    end = _chosen(free_end, members)[:, None]
+    end = free_end[members][:, None]
     # A short ray is sampled over its whole free part, so that no sample lies in the sensor.
     return members, end - depths * end.clamp(max=config.near_reach - config.near_margin)
 
@@ -379,11 +389,6 @@ def _rows(mask: Tensor) -> Tensor:
 def _taken(tensor: Tensor, rows: Tensor) -> Tensor:
     """``tensor[rows]`` of rows that ascend: the tensor itself, not copied, where they are all."""
     return tensor if len(rows) == len(tensor) else tensor.index_select(0, rows)
-
-
-def _chosen(tensor: Tensor, rows: Tensor) -> Tensor:
-    """``tensor[rows]`` of any rows."""
-    return tensor.index_select(0, rows)
 
 
 def spread_rows(num_points: int, count: int, rng: torch.Generator, *times: int) -> Tensor:

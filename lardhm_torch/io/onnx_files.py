@@ -5,17 +5,13 @@ from __future__ import annotations
 import importlib.util
 import os
 import warnings
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from lardhm_torch import features
 from lardhm_torch.io.atomic_files import replaced_file
-from lardhm_torch.learning.map_tensors import at_least_float32
-
-if TYPE_CHECKING:
-    from lardhm_torch.hilbert_map import LardHilbertMap
+from lardhm_torch.maps import OccupancyMap, num_neighbors, reads_map
 
 OPSET = 18
 LIBRARIES = ("onnx", "onnxscript")
@@ -29,14 +25,15 @@ class PlainMap(nn.Module):
     scale_tril: Tensor
     weights: Tensor
 
-    def __init__(self, model: LardHilbertMap) -> None:
+    def __init__(self, model: OccupancyMap) -> None:
         super().__init__()
-        centers = at_least_float32(model.centers.detach())
+        dtype = torch.promote_types(model.centers.dtype, torch.float32)
+        centers = model.centers.detach().to(dtype)
         self.register_buffer("origin", model.origin.double())
         self.register_buffer("centers", centers)
-        self.register_buffer("scale_tril", model.scale_tril.detach().to(centers.dtype))
-        self.register_buffer("weights", model.weights.detach().to(centers.dtype))
-        self.num_neighbors = min(model.num_neighbors, len(model))
+        self.register_buffer("scale_tril", model.scale_tril.detach().to(dtype))
+        self.register_buffer("weights", model.weights.detach().to(dtype))
+        self.num_neighbors = min(num_neighbors(model), len(centers))
 
     def forward(self, points: Tensor) -> Tensor:
         """(N, D) world positions [m], float64 -> (N,) probability; NaN where points are not finite."""
@@ -48,7 +45,8 @@ class PlainMap(nn.Module):
         return torch.sigmoid((values * self.weights[indices]).sum(dim=1) + 0 * local.sum(dim=1))
 
 
-def save_onnx(model: LardHilbertMap, path: str | os.PathLike[str]) -> None:
+@reads_map
+def save_onnx(model: OccupancyMap, path: str | os.PathLike[str]) -> None:
     """Write what `model(points)` computes as an ONNX model of opset 18.
 
     Its input ``points`` (N, D) has world positions [m] in float64, for any N from 1 on. Its output
@@ -69,7 +67,7 @@ def save_onnx(model: LardHilbertMap, path: str | os.PathLike[str]) -> None:
             f"ONNX models need {' and '.join(missing)}, which is not installed; "
             'install the extra: pip install "lardhm_torch[onnx]"'
         )
-    if len(model) == 0:
+    if len(model.weights) == 0:
         raise ValueError("model must have at least one cluster to be exported; this map is empty")
     example = model.origin.detach().cpu().double().repeat(3, 1)
     plain = PlainMap(model).eval().cpu()

@@ -13,7 +13,8 @@ _locks: weakref.WeakSet[MapLock] = weakref.WeakSet()
 
 
 class MapLock:
-    """Any number of readers, or one writer. Waiting writers have priority over new readers.
+    """Any number of readers, or one writer. They take turns: waiting writers have priority over new
+    readers, and the readers that wait for a writer have priority over the next one.
 
     A thread may nest reading in reading and in writing, and writing in writing. A copy of a lock is a
     new lock that nobody holds, and so are all locks in a forked process.
@@ -27,7 +28,9 @@ class MapLock:
         """Forget all readers and writers."""
         self._condition = threading.Condition()
         self._readers = 0
-        self._waiting = 0
+        self._waiting = 0  # writers
+        self._queued = 0  # readers
+        self._admitted = 0  # of these, those that go before the next writer
         self._writer: int | None = None
         self._turn = threading.RLock()  # of those who change the map
         self._own = threading.local()  # .depth: of nested reading in this thread
@@ -45,8 +48,8 @@ class MapLock:
         depth = getattr(own, "depth", 0)
         if depth == 0 and self._writer != me:
             with self._condition:
-                while self._writer is not None or self._waiting:
-                    self._condition.wait()
+                if self._writer is not None or self._waiting:
+                    self._queue()
                 self._readers += 1
             own.depth = 1
             try:
@@ -62,6 +65,16 @@ class MapLock:
                 yield
             finally:
                 own.depth = depth
+
+    def _queue(self) -> None:
+        """Wait as a reader."""
+        self._queued += 1
+        try:
+            while not self._admitted and (self._writer is not None or self._waiting):
+                self._condition.wait()
+        finally:
+            self._queued -= 1
+            self._admitted = max(0, min(self._admitted - 1, self._queued))
 
     @contextmanager
     def changing(self) -> Iterator[None]:
@@ -93,7 +106,7 @@ class MapLock:
         with self._condition:
             self._waiting += 1
             try:
-                while self._writer is not None or self._readers:
+                while self._writer is not None or self._readers or self._admitted:
                     self._condition.wait()
                 self._writer = me
             finally:
@@ -102,7 +115,7 @@ class MapLock:
             yield
         finally:
             with self._condition:
-                self._writer = None
+                self._writer, self._admitted = None, self._queued
                 self._condition.notify_all()
 
 
