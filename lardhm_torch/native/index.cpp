@@ -73,8 +73,8 @@ struct IndexBuilder {
     const Sections at(header);
     std::memset(to, 0, at.end);  // gaps, too: equal centers give equal bytes
     std::memcpy(to, &header, sizeof(Header));
-    std::memcpy(to + at.centers, centers, sizeof(T) * D * header.count);
-    std::memcpy(to + at.order, order.data(), 4 * order.size());
+    std::copy_n(centers, D * header.count, reinterpret_cast<T*>(to + at.centers));  // none may be null
+    std::copy_n(order.data(), order.size(), reinterpret_cast<int32_t*>(to + at.order));
     auto* relative_to = reinterpret_cast<float*>(to + at.relative);
     auto* boxes = reinterpret_cast<float*>(to + at.boxes);
     auto* tile_boxes = reinterpret_cast<float*>(to + at.tile_boxes);

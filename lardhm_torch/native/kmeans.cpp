@@ -121,7 +121,7 @@ Tensor kmeans(const Tensor& given_points, const Tensor& given_start, const Tenso
   dispatch(start, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
-    std::memcpy(out<T>(centers), in<T>(start), start.numel() * sizeof(T));
+    std::copy_n(in<T>(start), start.numel(), out<T>(centers));
     std::vector<T> met(start.size(0)), batch;
     const T* from = in<T>(points);
     const int64_t *row = in<int64_t>(rows), drawn = rows.numel();
