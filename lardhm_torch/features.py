@@ -34,6 +34,9 @@ class Kernel(NamedTuple):
     min_lengthscale: float = 0.0
 
 
+PLAIN = Kernel(1)  # neither scale nor floor: `kernel_factors` undoes `raw_factors`
+
+
 def kernel_factors(raw_scale_tril: Tensor, kernel: Kernel) -> Tensor:
     """(M, D, D) factors with log-transformed diagonals -> (M, D, D) kernel factors [m].
 

@@ -221,12 +221,11 @@ def sample_rays(
         ray_id[rows].view_as(depths).copy_(of_rays(rays, members)[:, None])
     labels = torch.zeros(count, device=points.device)
     labels[: len(hits)] = 1
-    known = Samples(points, labels, ray_id, dropped)
+    samples = Samples(points, labels, ray_id, dropped)
     channels = select_channels(scans.channels, hit_rays)
     seen = _rows(first)
     from_there = starts if len(starts) == 1 else _taken(starts, seen)
     lines = Lines(from_there, _taken(ahead, seen), _taken(free_end, seen))
-    samples = known
     if config.passing_samples:
         whole = lines._replace(reach=_taken(reach, seen))
         passing = seeded_generator(seed, "passing", ranges.device)
@@ -265,13 +264,8 @@ def _with_passing(
     rays, depths, widths = (column.repeat_interleave(counts) for column in found[:3])
     place = torch.rand(len(rays), generator=rng, device=rng.device, dtype=depths.dtype)
     depths = (depths + widths * (2 * place - 1)).clamp(min=0).minimum(ends[rays])
-    starts = lines.starts if len(lines.starts) == 1 else lines.starts[rays]
-    return replace(
-        known,
-        points=torch.cat([known.points, starts + depths[:, None] * lines.ahead[rays]]),
-        labels=torch.cat([known.labels, known.labels.new_zeros(len(rays))]),
-        ray_id=torch.cat([known.ray_id, ray_id[rays]]),
-    )
+    places = lines.starts_of(rays) + depths[:, None] * lines.ahead[rays]
+    return _appended(known, places, 0.0, ray_id[rays])
 
 
 def _thinned(samples: Samples, num_hits: int, limit: int, rng: torch.Generator) -> Samples:
@@ -308,11 +302,17 @@ def _with_unknown(
     depths = _depths_behind(len(ahead), config, rng)
     places = (known.points[: len(ahead), None] + depths * ahead[:, None]).flatten(0, 1)
     rows = _rows(never_crossed(places, *lines, config.cell_edge))
+    rays = known.ray_id[: len(ahead)].repeat_interleave(count)[rows]
+    return _appended(known, _taken(places, rows), UNKNOWN, rays)
+
+
+def _appended(samples: Samples, points: Tensor, label: float, ray_id: Tensor) -> Samples:
+    """The samples and, after them, (N, D) points with one label, on (N,) rays."""
     return Samples(
-        torch.cat([known.points, _taken(places, rows)]),
-        torch.cat([known.labels, known.labels.new_full((len(rows),), UNKNOWN)]),
-        torch.cat([known.ray_id, known.ray_id[: len(ahead)].repeat_interleave(count)[rows]]),
-        known.dropped,
+        torch.cat([samples.points, points]),
+        torch.cat([samples.labels, samples.labels.new_full((len(points),), label)]),
+        torch.cat([samples.ray_id, ray_id]),
+        samples.dropped,
     )
 
 

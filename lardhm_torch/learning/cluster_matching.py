@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import raw_factors, squared_distances
+from lardhm_torch.features import PLAIN, kernel_factors, raw_factors, squared_distances
 from lardhm_torch.learning.clustering import Clusters, concatenate_clusters, pool_clusters
 from lardhm_torch.learning.map_state import MapState, factor_covariances, new_rows
 
@@ -116,6 +116,5 @@ def moved_factors(raw_scale_tril: Tensor, before: Tensor, after: Tensor) -> Tens
 
     A factor that was not fine-tuned equals ``before`` and becomes ``after``.
     """
-    diagonal = raw_scale_tril.diagonal(dim1=-2, dim2=-1).exp()
-    factors = raw_scale_tril.tril(-1) + torch.diag_embed(diagonal)
+    factors = kernel_factors(raw_scale_tril, PLAIN)
     return raw_factors(after @ torch.linalg.solve_triangular(before, factors, upper=False))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import Kernel, kernel_factors, lard_kernel, raw_factors
+from lardhm_torch.features import PLAIN, Kernel, kernel_factors, lard_kernel, raw_factors
 from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.channel_sums import Layout, joint_layout, moved_sums, with_layout
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
@@ -88,8 +88,7 @@ def moved(
 
 def _rotated_factors(raw_scale_tril: Tensor, rotation: Tensor) -> Tensor:
     """Raw Cholesky factors of R L L^T R^T, from the QR decomposition of (R L)^T."""
-    diagonal = raw_scale_tril.double().diagonal(dim1=-2, dim2=-1).exp()
-    factors = raw_scale_tril.double().tril(-1) + torch.diag_embed(diagonal)
+    factors = kernel_factors(raw_scale_tril.double(), PLAIN)
     upper = torch.linalg.qr((rotation @ factors).mT, mode="r").R
     signs = upper.diagonal(dim1=-2, dim2=-1).sign()
     return raw_factors((signs[..., None] * upper).mT).to(raw_scale_tril.dtype)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.channels import CLASS, COLOR
+from lardhm_torch.features import PLAIN, kernel_factors
 from lardhm_torch.learning.channel_queries import RIDGE, affine_functions
 from lardhm_torch.learning.channel_sums import check_layout, num_rows, rows_of
 from lardhm_torch.learning.map_tensors import MapTensors
@@ -65,8 +66,7 @@ def _shapes_of(state: dict[str, Any]) -> tuple[Tensor, Tensor]:
     """(S, D) centers and (S, D, D) factors of the occupied clusters, float64 [m]."""
     rows = state["is_occupied"]
     raw = state["raw_scale_tril"][rows].double()
-    diagonal = torch.diag_embed(raw.diagonal(dim1=1, dim2=2).exp())
-    return state["centers"][rows].double(), raw.tril(-1) + diagonal
+    return state["centers"][rows].double(), kernel_factors(raw, PLAIN)
 
 
 def with_packed_channels(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import fields
 from functools import partial
 from typing import Any, TypeVar
@@ -32,15 +31,13 @@ class MapParameters(MapTensors):
     Args and attributes: see `LardHilbertMap`.
     """
 
-    @contextmanager
-    def reading(self) -> Iterator[None]:
+    def reading(self) -> AbstractContextManager[None]:
         """A context in which all queries see the same map: other threads wait before they change it.
 
         Every single query sees one map anyway, while another thread runs `fit`, `update`, `fine_tune`
         or any other function of this package that changes the map.
         """
-        with self.lock.reading():
-            yield
+        return self.lock.reading()
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """See `torch.nn.Module.load_state_dict`; the map adopts the number of clusters."""

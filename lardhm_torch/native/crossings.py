@@ -32,6 +32,10 @@ class Lines(NamedTuple):
     ahead: Tensor
     reach: Tensor
 
+    def starts_of(self, rays: Tensor) -> Tensor:
+        """(P, D) or (1, D) starts of some rays."""
+        return self.starts if len(self.starts) == 1 else self.starts[rays]
+
 
 class Passages(NamedTuple):
     """Places where rays pass through patches, by ray."""
@@ -160,7 +164,7 @@ def _passing(
     """(P,) rays and (P,) patches that they pass through, of some rays; see `passages`."""
     rays, leaves = _boxes_met(rays, lines, ends, boxes)
     depths, _, squared = _closest(rays, leaves, lines, patches)
-    start, ahead = _starts(lines, rays), lines.ahead[rays]
+    start, ahead = lines.starts_of(rays), lines.ahead[rays]
     normals = patches.normals[leaves]
     before = ((start - patches.means[leaves]) * normals).sum(dim=1)
     after = before + lines.reach[rays] * (ahead * normals).sum(dim=1)
@@ -184,7 +188,7 @@ def _closest(
     rays: Tensor, leaves: Tensor, lines: Lines, patches: Patches
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of pairs: (P,) depths of the largest kernel value, widths there, squared standard deviations."""
-    offsets, ahead = patches.means[leaves] - _starts(lines, rays), lines.ahead[rays]
+    offsets, ahead = patches.means[leaves] - lines.starts_of(rays), lines.ahead[rays]
     precisions = patches.precisions[leaves]
     scaled = (precisions @ ahead[:, :, None]).squeeze(2)
     slopes = (scaled * ahead).sum(dim=1)
@@ -207,17 +211,13 @@ def _boxes_met(
         if level:
             rays = rays.repeat_interleave(2)
             nodes = (2 * nodes[:, None] + torch.arange(2, device=rays.device)).flatten()
-        ahead, start = lines.ahead[rays], _starts(lines, rays)
+        ahead, start = lines.ahead[rays], lines.starts_of(rays)
         inverse = 1 / ahead.where(ahead.abs() > SLOW, SLOW)
         sides = torch.stack([(low[nodes] - start) * inverse, (high[nodes] - start) * inverse])
         enter = sides.amin(dim=0).amax(dim=1).clamp(min=0)
         met = enter <= sides.amax(dim=0).amin(dim=1).minimum(ends[rays])
         rays, nodes = rays[met], nodes[met]
     return rays, nodes
-
-
-def _starts(lines: Lines, rays: Tensor) -> Tensor:
-    return lines.starts if len(lines.starts) == 1 else lines.starts[rays]
 
 
 def table_entry(cells: Tensor) -> Tensor:
