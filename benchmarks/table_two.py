@@ -18,7 +18,9 @@ from lardhm_torch import LardHilbertMap, SamplingConfig, Scans, load_scans, samp
 
 NUM_CLUSTERS, NUM_NEIGHBORS, RESOLUTION = 500, 5, 0.05
 NUM_POINTS, NUM_QUERIES = 82_842, 638_683
-ONE_FREE_POINT = SamplingConfig(min_range=0.0, free_samples=1, near_samples=0)
+ONE_FREE_POINT = SamplingConfig(
+    min_range=0.0, free_samples=1, near_samples=0, passing_samples=0, behind_samples=0
+)
 
 
 class Task(NamedTuple):

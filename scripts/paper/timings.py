@@ -34,7 +34,9 @@ from lardhm_torch.learning.points import in_morton_order
 NUM_CLUSTERS, NUM_NEIGHBORS, RESOLUTION = 500, 5, 0.05
 NUM_POINTS, NUM_QUERIES = 82_842, 638_683
 RUNS, SLOW_RUNS = 10, 3
-ONE_FREE_POINT = SamplingConfig(min_range=0.0, free_samples=1, near_samples=0)
+ONE_FREE_POINT = SamplingConfig(
+    min_range=0.0, free_samples=1, near_samples=0, passing_samples=0, behind_samples=0
+)
 ONE_PASS = FitConfig(passes=1)
 GRID_CELL = 0.2  # [m] of Original HM: 15,750 nodes over the room, as the authors' program
 POINTS_PER_PROCESS = NUM_POINTS // NUM_CLUSTERS  # as many processes as clusters
