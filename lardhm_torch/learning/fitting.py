@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
+from lardhm_torch.learning.bridging import bridged
 from lardhm_torch.learning.clustering import cluster_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
@@ -45,6 +46,8 @@ class FitConfig:
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # loss of unknown points, relative to all others
+    # Surfaces go on across gaps that no ray passed through, as between the rings of a lidar (`bridging`)
+    bridge_gaps: bool = True
     # 0: the number of clusters is chosen from the points, and the weights are trained. 4: the scene
     # decides on the number (`scene_clusters`), and so many passes train centers and length-scales, too.
     # A third of the clusters then answers points as well, but ranges and meshes are less exact.
@@ -116,6 +119,8 @@ def fit_clusters(
     clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
     state = replace(state, evidence=fitted_evidence(points, labels, state, task.rng))
+    if task.config.bridge_gaps:
+        state, points, labels = bridged(state, points, labels, task.kernel, task.rng)
     columns = settle_unknown(points, labels, state, task.kernel, task.rng)
     batch_size = task.config.rows_per_batch(len(columns[0]))
     points, labels = stratified_batches(columns, batch_size, task.rng)
