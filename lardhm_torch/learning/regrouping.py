@@ -154,6 +154,7 @@ def _half(
         rows,
         weights=parents.weights,
         doubts=parents.doubts,
+        times=parents.times,
         fresh=kept_counts(evidence).to(parents.fresh),
         channel_sums=parents.channel_sums * fraction[:, None, None],
         class_weights=parents.class_weights,
