@@ -120,9 +120,14 @@ def reads_copy(function: Callable[P, R]) -> Callable[P, R]:
     return read
 
 
-def pieces(model: OccupancyMap) -> Iterable[OccupancyMap]:
-    """Maps that together contain every cluster once: the tiles of a tiled map, or the map itself."""
-    return model.pieces() if hasattr(model, "pieces") else (model,)
+def pieces(
+    model: OccupancyMap, bounds: tuple[Tensor, Tensor] | None = None
+) -> Iterable[OccupancyMap]:
+    """Maps that together contain every cluster once: the tiles of a tiled map, or the map itself.
+
+    With the corners (D,) of a box, world frame [m], only those tiles that contribute in it.
+    """
+    return model.pieces(bounds) if hasattr(model, "pieces") else (model,)
 
 
 def local_parts(

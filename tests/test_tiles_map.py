@@ -362,3 +362,33 @@ def test_bad_arguments_are_named(tmp_path, monkeypatch):
         TiledMap.split(random_map(), tmp_path / "new", 0.0)
     with pytest.raises(AttributeError, match="no attribute 'fit'"):
         tiles.fit()
+
+
+def test_a_part_of_a_tiled_map_is_meshed_from_the_tiles_that_it_needs(tmp_path, monkeypatch):
+    tiles = tiled(random_map(1), tmp_path, monkeypatch)
+    lower, upper = map_bounds(tiles)
+    bounds = lower, lower + 0.3 * (upper - lower)
+    assert 0 < len(list(tiles.pieces(bounds))) < len(list(tiles.pieces()))
+    part, single = (extract_mesh(m, 0.2, bounds=bounds, color=None) for m in (tiles, tiles.merge()))
+    assert len(part.faces) == len(single.faces) > 0
+    ours, theirs = (mesh.vertices[np.lexsort(mesh.vertices.T)] for mesh in (part, single))
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_parts_of_a_map_have_the_faces_of_the_whole(tmp_path, monkeypatch):
+    tiles = tiled(random_map(2), tmp_path, monkeypatch)
+    lower, upper = map_bounds(tiles)
+    lower, upper = (lower / 0.2).floor() * 0.2, (upper / 0.2).ceil() * 0.2
+    middle = (lower / 0.2 + ((upper - lower) / 0.4).round()).round() * 0.2
+    count = len(
+        extract_mesh(tiles, 0.2, bounds=(lower, upper), color=None, surface="crossing").faces
+    )
+    found = 0
+    for side in range(2):
+        low, high = lower.clone(), upper.clone()
+        (high if side == 0 else low)[0] = middle[0]
+        found += len(
+            extract_mesh(tiles, 0.2, bounds=(low, high), color=None, surface="crossing").faces
+        )
+    assert count > 1000
+    assert found == pytest.approx(count, rel=0.001)

@@ -219,7 +219,9 @@ def map_bounds(model: OccupancyMap, margin: float = 0.0) -> tuple[Tensor, Tensor
     return lower.amin(dim=0) - margin, upper.amax(dim=0) + margin
 
 
-def cluster_boxes(model: OccupancyMap, sign: int = 0) -> tuple[Tensor, Tensor]:
+def cluster_boxes(
+    model: OccupancyMap, sign: int = 0, bounds: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Axis-aligned boxes of three standard deviations around each cluster.
 
     The standard deviation of a kernel along axis d is the length of row d of its factor.
@@ -227,12 +229,14 @@ def cluster_boxes(model: OccupancyMap, sign: int = 0) -> tuple[Tensor, Tensor]:
     Args:
         model: the map.
         sign: 1 or -1 for the clusters whose weights have this sign; 0 for all.
+        bounds: corners (D,) of a box, world frame [m]; boxes that do not touch it may be
+            left out. None: all of space.
 
     Returns:
         (M, D) lower and (M, D) upper corners, float64, world frame [m].
     """
     boxes = []
-    for piece in pieces(model):
+    for piece in pieces(model, bounds):
         chosen = piece.weights.detach() * sign > 0 if sign else slice(None)
         factors = piece.scale_tril.detach()[chosen].double()
         half_edges = NUM_STDS * torch.linalg.vector_norm(factors, dim=2)

@@ -46,7 +46,7 @@ def estimate_mesh(
         sign: of the weights of the supporting clusters.
     """
     areas = [torch.zeros(0, dtype=torch.float64)]
-    for piece in pieces(model):
+    for piece in pieces(model, bounds):
         chosen = piece.weights * sign > 0
         if bounds is not None:
             centers = piece.centers + piece.origin

@@ -122,8 +122,8 @@ def seed_blocks(model: OccupancyMap, lattice: Lattice, rule: Rule) -> np.ndarray
     ways = ways[(ways.abs().sum(dim=1) == 1) | (ways.abs().sum(dim=1) == 3)]
     ways = ways / ways.norm(dim=1, keepdim=True)
     found = [np.zeros(0, dtype=np.int64)]
-    for piece in pieces(model):
-        chosen = (piece.weights.detach() * rule.sign > 0).nonzero().squeeze(1)
+    for piece in pieces(model, lattice.bounds if lattice.is_cut else None):
+        chosen = _near(piece, lattice, rule.sign)
         for rows in chosen.split(SEED_CLUSTERS):
             axes, stds, _ = torch.linalg.svd(piece.scale_tril.detach()[rows].double())
             centers = piece.centers.detach()[rows].double() + piece.origin
@@ -139,6 +139,15 @@ def seed_blocks(model: OccupancyMap, lattice: Lattice, rule: Rule) -> np.ndarray
             ends = torch.cat([lines[1:][crossed], lines[:-1][crossed]])
             found.append(lattice.blocks_at(ends.cpu().numpy()))
     return np.unique(np.concatenate(found))
+
+
+def _near(piece: OccupancyMap, lattice: Lattice, sign: int) -> Tensor:
+    """Rows of the clusters of a sign whose lines reach the lattice."""
+    rows = (piece.weights.detach() * sign > 0).nonzero().squeeze(1)
+    centers = piece.centers.detach()[rows].double() + piece.origin
+    reach = SEED_RADII[-1] * piece.scale_tril.detach()[rows].double().norm(dim=2)
+    lower, upper = (end.to(centers) for end in lattice.bounds)
+    return rows[((centers + reach >= lower) & (centers - reach <= upper)).all(dim=1)]
 
 
 def _regions(model: OccupancyMap, lattice: Lattice, blocks: np.ndarray) -> Iterator[tuple]:

@@ -131,13 +131,14 @@ def surface_lattice(
         The lattice; None if no supporting cluster is near the bounds.
     """
     sign, corners = _sign(threshold), None
-    lower, upper = (box.cpu().numpy() for box in cluster_boxes(model, sign))
     if bounds is not None:
         corner, end = (to_tensor(b, "bounds").cpu() for b in bounds)
         corners = corner, end
         if len(grid_axes(corner, end, resolution)) != 3:
             raise ValueError(f"bounds must have 3 coordinates; got {len(corner)}")
-        low, high = corner.numpy(), end.numpy()
+    lower, upper = (box.cpu().numpy() for box in cluster_boxes(model, sign, corners))
+    if corners is not None:
+        low, high = (end.numpy() for end in corners)
         touching = ((upper >= low) & (lower <= high)).all(axis=1)
         lower, upper = lower[touching], upper[touching]
     if len(lower) == 0:
@@ -177,7 +178,7 @@ def lattice_mesh(
         return trimesh.Trimesh(process=False)
     sign = _sign(threshold)
     rule = Rule(threshold_log_odds(threshold), sign, evidence)
-    boxes = cluster_boxes(model, sign)
+    boxes = cluster_boxes(model, sign, lattice.bounds if lattice.is_cut else None)
     if evidence is None:
         starts = blocks_near_boxes(lattice, *boxes)
     else:

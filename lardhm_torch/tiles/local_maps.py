@@ -76,9 +76,12 @@ class LocalMaps:
             self.cache.put_map("whole", model)
         return model
 
-    def tile_maps(self) -> Iterator[LardHilbertMap]:
-        """The map of each tile, in its own frame."""
-        return (self._join([tile], tile["origin"]) for tile in self._tiles())
+    def tile_maps(self, bounds: tuple[Tensor, Tensor] | None = None) -> Iterator[LardHilbertMap]:
+        """The map of each tile, or of those that a box (D,) to (D,) needs, in its own frame."""
+        tiles = self._tiles()
+        if bounds is not None:
+            tiles = (self._tile(row) for row in needed_tiles(self.layout, *bounds).tolist())
+        return (self._join([tile], tile["origin"]) for tile in tiles)
 
     def _joined_map(self, rows: Tensor, points: Tensor) -> LardHilbertMap:
         """The map of tiles (S,), cached; an error if the box of the points needs a damaged one."""

@@ -228,9 +228,9 @@ class TiledMap:
             total.update(tile.thickness_counts())
         return total
 
-    def pieces(self) -> Iterator[LardHilbertMap]:
-        """The maps of the tiles, one at a time."""
-        return self._local.tile_maps()
+    def pieces(self, bounds: tuple[Tensor, Tensor] | None = None) -> Iterator[LardHilbertMap]:
+        """The maps of the tiles, one at a time; with the corners of a box only of those that it needs."""
+        return self._local.tile_maps(bounds)
 
     def merge(self, bounds: tuple[Corner, Corner] | None = None) -> LardHilbertMap:
         """An ordinary map, in memory, that answers in a box as this map does.
