@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.learning.fitting import FitConfig as FitConfig
     from lardhm_torch.learning.map_merging import merge_maps as merge_maps
     from lardhm_torch.learning.parameters import resize_optimizer as resize_optimizer
+    from lardhm_torch.learning.registration import registration_error as registration_error
     from lardhm_torch.learning.update import UpdateConfig as UpdateConfig
     from lardhm_torch.queries.bodies import Body as Body
     from lardhm_torch.queries.bodies import body_collision_probability as body_collision_probability
@@ -77,6 +78,7 @@ _NAMES = {
     "learning.fitting": ["FitConfig"],
     "learning.map_merging": ["merge_maps"],
     "learning.parameters": ["resize_optimizer"],
+    "learning.registration": ["registration_error"],
     "learning.update": ["UpdateConfig"],
     "queries.bodies": [
         "Body",

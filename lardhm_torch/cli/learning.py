@@ -76,7 +76,7 @@ def fit(arguments: argparse.Namespace) -> None:
 
 
 def _fit_at_once(arguments: argparse.Namespace) -> None:
-    from lardhm_torch import sample_rays
+    from lardhm_torch import registration_error, sample_rays
 
     if arguments.resume or arguments.view or arguments.radius is not None:
         raise ValueError("--resume, --view and --radius need --incremental")
@@ -93,6 +93,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     report_dropped(samples.dropped)
     if not bool((samples.labels == 1).any()):
         raise ValueError(f"scans must hold at least one hit within range; got {samples.dropped}")
+    error = registration_error(scans)
+    noise = error if arguments.hit_noise is None else arguments.hit_noise
     model = _new_map(scans.dim, arguments)
     model.fit(
         samples.points,
@@ -100,17 +102,18 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
         channels=samples.channels,
         progress=True,
-        **fit_settings(arguments),
+        **fit_settings(arguments, noise),
     )
     if arguments.tune or arguments.tune_state:
-        _tune(model, scans, samples, state, arguments)
+        _tune(model, scans, samples, state, noise, arguments)
     if arguments.uncertainty:
         model.fit_uncertainty(samples.points, samples.labels)
     model.save(arguments.output)
     hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
+    registered = f"; scans registered to {100 * error:.1f} cm" if error else ""
     print(
         f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}"
-        f"{far_hits(arguments)}"
+        f"{far_hits(arguments)}{registered}"
     )
 
 
@@ -138,10 +141,11 @@ def _tune(
     scans: Scans,
     samples: Samples,
     state: dict[str, Any] | None,
+    hit_noise: float,
     arguments: argparse.Namespace,
 ) -> None:
     """Fine-tune with free points sampled anew in every epoch."""
-    from lardhm_torch import fine_tune, sample_rays
+    from lardhm_torch import TuneConfig, fine_tune, sample_rays
     from lardhm_torch.io.map_files import save_state
 
     path, sampling = arguments.tune_state, sampling_of(arguments)
@@ -154,6 +158,7 @@ def _tune(
         state=state,
         after_epoch=(lambda state: save_state(state, path)) if path else None,
         progress=True,
+        config=TuneConfig(hit_noise=hit_noise),
     )
 
 
