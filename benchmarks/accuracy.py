@@ -33,8 +33,8 @@ from lardhm_torch import (
     LardHilbertMap,
     Scans,
     load_scans,
-    registration_error,
     sample_rays,
+    scan_disagreement,
     split_rays,
 )
 from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
@@ -57,7 +57,7 @@ LOWER_IS_BETTER = ("log_loss", "brier", "ece", "unknown")
 def lard_hilbert_map(train: Scans, seed: int, *, is_blurred: bool = False) -> Model:
     """A map with default settings, or as by ``lardhm fit --hit-noise auto``."""
     samples = sample_rays(train, seed=seed)
-    config = FitConfig(hit_noise=registration_error(train) if is_blurred else 0.0)
+    config = FitConfig(hit_noise=scan_disagreement(train) if is_blurred else 0.0)
     model = LardHilbertMap(dim=train.dim)
     return model.fit(samples.points, samples.labels, seed=seed, config=config)
 
@@ -68,7 +68,7 @@ def tuned_hilbert_map(train: Scans, seed: int, *, is_blurred: bool = False) -> M
     from lardhm_torch import TuneConfig, fine_tune
 
     samples = sample_rays(train, seed=seed)
-    noise = registration_error(train) if is_blurred else 0.0
+    noise = scan_disagreement(train) if is_blurred else 0.0
     config = FitConfig(hit_noise=noise)
     model = LardHilbertMap(dim=train.dim)
     model.fit(samples.points, samples.labels, seed=seed, config=config)

@@ -76,7 +76,7 @@ def fit(arguments: argparse.Namespace) -> None:
 
 
 def _fit_at_once(arguments: argparse.Namespace) -> None:
-    from lardhm_torch import registration_error, sample_rays
+    from lardhm_torch import sample_rays, scan_disagreement
 
     if arguments.resume or arguments.view or arguments.radius is not None:
         raise ValueError("--resume, --view and --radius need --incremental")
@@ -93,8 +93,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     report_dropped(samples.dropped)
     if not bool((samples.labels == 1).any()):
         raise ValueError(f"scans must hold at least one hit within range; got {samples.dropped}")
-    error = registration_error(scans)
-    noise = error if arguments.hit_noise is None else arguments.hit_noise
+    apart = scan_disagreement(scans)
+    noise = apart if arguments.hit_noise is None else arguments.hit_noise
     model = _new_map(scans.dim, arguments)
     model.fit(
         samples.points,
@@ -110,10 +110,10 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         model.fit_uncertainty(samples.points, samples.labels)
     model.save(arguments.output)
     hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
-    registered = f"; scans registered to {100 * error:.1f} cm" if error else ""
+    disagree = f"; scans disagree by {100 * apart:.1f} cm" if apart else ""
     print(
         f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}"
-        f"{far_hits(arguments)}{registered}"
+        f"{far_hits(arguments)}{disagree}"
     )
 
 

@@ -41,7 +41,7 @@ def add_hit_noise(sub: argparse.ArgumentParser) -> None:
         default=0.0,
         metavar="METERS",
         help="make surfaces thicker by this standard deviation, for queries at the poses of other scans "
-        "than SCANS; auto: the registration error, estimated where SCANS overlap (default: 0)",
+        "than SCANS; auto: what SCANS disagree by, estimated where they overlap (default: 0)",
     )
 
 

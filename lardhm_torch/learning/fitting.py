@@ -47,7 +47,7 @@ class FitConfig:
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # loss of unknown points, relative to all others
     # [m] Standard deviation by which hits are moved while the weights are trained: where other scans
-    # will see the surfaces, see `registration.registration_error`. 0: exactly where these scans see them.
+    # will see the surfaces, see `scan_disagreement`. 0: exactly where these scans see them.
     hit_noise: float = 0.0
     # 0: the number of clusters is chosen from the points, and the weights are trained. 4: the scene
     # decides on the number (`scene_clusters`), and so many passes train centers and length-scales, too.

@@ -176,7 +176,7 @@ def in_morton_order(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
 def blurred_hits(points: Tensor, labels: Tensor, noise: float, rng: torch.Generator) -> Tensor:
     """(N, D) positions of which the occupied ones are moved at random, so that surfaces get thicker.
 
-    Weights that are trained there make the map as sure of a surface as its registration is.
+    Weights that are trained there make the map as unsure of a surface as the scans disagree.
 
     Args:
         points: (N, D) positions [m].

@@ -1,6 +1,4 @@
-"""The registration error of scans, and maps whose surfaces are as thick as that."""
-
-import math
+"""How far scans disagree, and maps whose surfaces are as thick as that."""
 
 import pytest
 import torch
@@ -15,9 +13,9 @@ from lardhm_torch import (
     UpdateConfig,
     fine_tune,
     load_scans,
-    registration_error,
     sample_rays,
     save_scans,
+    scan_disagreement,
     simulate_room,
 )
 from lardhm_torch.learning.points import blurred_hits
@@ -33,16 +31,16 @@ def moved_room(distance, num_rays=24_000, seed=0):
 
 
 @pytest.mark.parametrize("distance", [0.02, 0.05])
-def test_the_error_is_that_of_the_poses(distance):
-    error = registration_error(moved_room(distance, 60_000))
-    assert error == pytest.approx(1.4826 * distance / math.sqrt(2), rel=0.15)
+def test_scans_disagree_as_their_poses_do(distance):
+    apart = scan_disagreement(moved_room(distance, 60_000))
+    assert apart == pytest.approx(1.4826 * distance, rel=0.15)
 
 
-def test_well_registered_scans_have_none():
-    assert registration_error(moved_room(0.0)) < 0.002
+def test_well_registered_scans_agree():
+    assert scan_disagreement(moved_room(0.0)) < 0.002
 
 
-def test_the_error_does_not_depend_on_the_frame():
+def test_the_frame_does_not_matter():
     scans = moved_room(0.03)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).double())[
         0
@@ -51,7 +49,7 @@ def test_the_error_does_not_depend_on_the_frame():
     turned = Scans(
         scans.origins @ turn + far, scans.ends @ turn + far, scans.scan_id, scans.is_return
     )
-    assert registration_error(turned) == pytest.approx(registration_error(scans), rel=0.2)
+    assert scan_disagreement(turned) == pytest.approx(scan_disagreement(scans), rel=0.2)
 
 
 def grid_wall(height, origin, count=60):
@@ -72,27 +70,27 @@ def joined(*parts):
 
 def test_the_two_sides_of_a_wall_are_two_surfaces():
     front = grid_wall(0.0, [1.5, 1.5, -2.0])
-    assert registration_error(joined(front, grid_wall(0.2, [1.5, 1.5, 2.0]))) == 0
-    same_side = registration_error(joined(front, grid_wall(0.2, [1.0, 1.5, -2.0])))
-    assert same_side == pytest.approx(1.4826 * 0.2 / math.sqrt(2), rel=0.05)
+    assert scan_disagreement(joined(front, grid_wall(0.2, [1.5, 1.5, 2.0]))) == 0
+    same_side = scan_disagreement(joined(front, grid_wall(0.2, [1.0, 1.5, -2.0])))
+    assert same_side == pytest.approx(1.4826 * 0.2, rel=0.05)
 
 
-def test_flat_scans_have_an_error_too():
+def test_flat_scans_disagree_too():
     axis = torch.linspace(0, 6, 3000, dtype=torch.float64)
     walls = [torch.stack([axis, torch.full_like(axis, y)], dim=1) for y in (2.0, 2.03)]
     rng = torch.Generator().manual_seed(0)
     walls = [wall + 0.002 * torch.randn(wall.shape, generator=rng) for wall in walls]
     origin = torch.tensor([[3.0, 0.0]], dtype=torch.float64)
-    error = registration_error(joined((origin, walls[0]), (origin, walls[1])))
-    assert error == pytest.approx(1.4826 * 0.03 / math.sqrt(2), rel=0.1)
+    apart = scan_disagreement(joined((origin, walls[0]), (origin, walls[1])))
+    assert apart == pytest.approx(1.4826 * 0.03, rel=0.1)
 
 
-def test_scans_that_share_no_surface_have_none():
+def test_scans_that_share_no_surface_do_not_disagree():
     one = grid_wall(0.0, [1.5, 1.5, -2.0])
-    assert registration_error(joined(one)) == 0
-    assert registration_error(joined(one, grid_wall(40.0, [1.5, 1.5, 35.0]))) == 0
+    assert scan_disagreement(joined(one)) == 0
+    assert scan_disagreement(joined(one, grid_wall(40.0, [1.5, 1.5, 35.0]))) == 0
     empty = Scans(torch.zeros(1, 3), torch.zeros(0, 3))
-    assert registration_error(empty) == 0
+    assert scan_disagreement(empty) == 0
 
 
 def test_only_hits_are_blurred():
@@ -178,10 +176,10 @@ def test_the_noise_is_a_length(config, noise):
 def test_the_command_line_estimates_the_noise_or_takes_it(tmp_path, capsys):
     path = tmp_path / "room.npz"
     save_scans(moved_room(0.1, 9000), path)
-    error = registration_error(load_scans(path))
-    for name, words in (("auto", ["auto"]), ("given", [error]), ("none", [0])):
+    apart = scan_disagreement(load_scans(path))
+    for name, words in (("auto", ["auto"]), ("given", [apart]), ("none", [0])):
         run("fit", path, "-o", tmp_path / f"{name}.pt", "--clusters", 100, "--hit-noise", *words)
-        assert f"scans registered to {100 * error:.1f} cm" in capsys.readouterr().out
+        assert f"scans disagree by {100 * apart:.1f} cm" in capsys.readouterr().out
     auto, given, none = (
         LardHilbertMap.load(tmp_path / f"{name}.pt").weights for name in ("auto", "given", "none")
     )

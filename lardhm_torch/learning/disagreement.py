@@ -1,4 +1,4 @@
-"""How well scans are registered: how far apart they see the same surfaces.
+"""How far apart scans see the same surfaces.
 
 Poses of scans are known to centimeters, while the noise of one scan is a few millimeters. A map that
 takes poses as exact is sure of surfaces that the next scan will see a few centimeters away. What scans
@@ -36,20 +36,21 @@ class Offsets(NamedTuple):
     patches: Tensor
 
 
-def registration_error(scans: Scans, *, seed: int = 0) -> float:
-    """Standard deviation of the surfaces of a scan about where they are [m], from scans that overlap.
+def scan_disagreement(scans: Scans, *, seed: int = 0) -> float:
+    """Standard deviation of the surfaces of one scan about those of another [m].
 
     Half of the hits of a scan are divided into patches. Two medians of distances from the planes of the
     flat ones are compared: of the other half of its hits, and of the hits of other scans; both of the
-    same patches, each of which has the same weight. What the second variance has more than the first is
-    the disagreement of two scans, twice the variance of the error of one.
+    same patches, each of which has the same weight. The disagreement is what the second variance has
+    more than the first. If scans are registered with independent errors, it is sqrt(2) times the error
+    of one.
 
     Args:
         scans: range scans, world frame.
         seed: of the random choice of hits.
 
     Returns:
-        The error, for ``FitConfig(hit_noise=...)``; 0 if there is only one scan, or if no disagreement is
+        The disagreement, for ``FitConfig(hit_noise=...)``; 0 if there is only one scan, or if none is
         significant on the flat surfaces that scans have in common.
     """
     config = SamplingConfig()
@@ -58,7 +59,7 @@ def registration_error(scans: Scans, *, seed: int = 0) -> float:
     numbers = scans.scan_id[rays].unique()
     numbers = numbers[:: -(-max(1, len(numbers)) // MOST_SCANS)]
     count = min(len(rays), MOST_HITS // max(1, len(numbers)))
-    rng = seeded_generator(seed, "registration", rays.device)
+    rng = seeded_generator(seed, "disagreement", rays.device)
     found, begin = [], 0
     for number in numbers:
         own = rays[scans.scan_id[rays] == number]
@@ -82,7 +83,7 @@ def registration_error(scans: Scans, *, seed: int = 0) -> float:
     doubt = MEDIAN_ERROR * math.hypot(noise, apart) / max(1, len(common)) ** 0.5
     if apart - noise <= 2 * doubt:
         return 0.0
-    return DEVIATIONS_PER_MEDIAN * math.sqrt((apart**2 - noise**2) / 2)
+    return DEVIATIONS_PER_MEDIAN * math.sqrt(apart**2 - noise**2)
 
 
 def patch_offsets(scans: Scans, rays: Tensor, origin: Tensor, patches: Patches) -> Offsets:
