@@ -13,6 +13,7 @@ from torch import Tensor
 from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import (
+    aging,
     channel_sums,
     class_training,
     map_merging,
@@ -60,7 +61,8 @@ class LardHilbertMap(MapQueries):
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
             clusters of unknown points have count 0.
         evidence: (M, 32, D) buffer [m], points kept by the clusters, padded with infinity.
-        losses, doubts, fresh: (M,) buffers, used by `update` (see docs).
+        losses, doubts, fresh, times: (M,) buffers, used by `update` (see docs).
+        max_age: `update` removes clusters that were not seen for longer [s]; None: never. Saved.
         posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; a variance
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
@@ -95,14 +97,12 @@ class LardHilbertMap(MapQueries):
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
-            num_clusters: total over both classes, half each; a class too small for its half
-                leaves the remainder to the other. None: chosen from the data
-                (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
+            num_clusters: total over both classes, half each; a class too small for its half leaves
+                the rest to the other. None: chosen from the data (`clustering.choose_num_clusters`).
             seed: random seed of clustering and training.
-            max_bytes: instead of a number of clusters, the size of the file that `pack` writes: the map
-                gets as many clusters as fit into it.
-            channels: values of the points by name, such as `Samples.channels`; those of the occupied
-                points are summed up in the clusters. They do not change the occupancy.
+            max_bytes: size of the file that `pack` writes: as many clusters as fit into it.
+            channels: values of the points by name, such as `Samples.channels`; those of occupied
+                points are summed up in the clusters, and do not change the occupancy.
             progress: show a progress bar on a terminal.
             config: training settings.
 
@@ -267,23 +267,23 @@ class LardHilbertMap(MapQueries):
         *,
         seed: int = 0,
         channels: Channels | None = None,
+        time: float | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
-        """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
+        """Update the map with one more scan. On an empty map this is `fit`.
 
         Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
         near them are regrouped, and the weights there are trained on the kept points. Parameters
-        remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
-        without points are removed, and the last rows take their places. If anything fails, the map
-        is unchanged.
+        remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). The last
+        rows take the places of removed clusters. If anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m]; an empty set leaves the map unchanged.
             labels: (N,) 1 occupied, 0 free, 1/2 unknown.
-            num_clusters: maximum number of clusters near the points, over all classes. None: chosen
-                from the number of hits there.
+            num_clusters: maximum number near the points, over all classes; None: chosen from them.
             seed: random seed of clustering and training.
             channels: see `fit`; channels and classes that are new to the map are added to it.
+            time: time stamp of the scan [s]; needed if the map has a ``max_age``.
             config: update settings; `UpdateConfig(as_in_paper=True)` follows the paper.
 
         Returns:
@@ -291,35 +291,37 @@ class LardHilbertMap(MapQueries):
 
         Raises:
             ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, num_clusters is not a
-                positive integer, or a channel is invalid or of another width than in the map.
+                positive integer, a channel is invalid or of another width, or the time is missing.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
         self.check_learns()
+        aging.check_time(time, self.max_age)
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
-            return self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+            self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+            return aging.stamped(self, time)
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "update", self.centers.device)
         task = Task(self.kernel, config or UpdateConfig(), rng)
         hits = channel_sums.hits_with_channels(*samples[:2], channels)
-        old = self.channel_layout
-        layout = channel_sums.joint_layout(old, channel_sums.layout_of(hits.channels))
-        state = channel_sums.with_layout(parameters.read_state(self), old, layout)
+        state = parameters.read_state(self)
+        state, layout = channel_sums.with_layout_of(hits, state, self.channel_layout)
         changes = updated(state, *samples[:2], num_clusters, task)
         part = channel_sums.with_hits(changes.part, layout, hits)
+        part = aging.timed(part, *samples[:2], self.kernel, time)
         parameters.write_rows(self, changes.where, part, changes.removed, layout)
+        aging.forget_old(self, time)
         return self
 
     @changes_map
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
         """Apply the rigid transform x -> rotation x + translation to the map.
 
-        The transform is exact and needs no training, so that a submap can be moved to its new pose
-        after a loop closure. The posterior of the weights is kept.
+        The transform is exact, for example after a loop closure. The posterior is kept.
 
         Args:
             rotation: (D, D) orthonormal, determinant 1.
@@ -362,8 +364,8 @@ class LardHilbertMap(MapQueries):
 
         Args:
             path: file; the extension ``.safetensors`` selects that format.
-            evidence: write the points kept by the clusters, too. Without them the file is about a
-                quarter as large, and a later `update` draws points from the clusters' moments.
+            evidence: write what updates need, too. Without it the file is about a quarter as large; a
+                later `update` draws points from the moments of the clusters, whose age is unknown.
         """
         with self.lock.reading():
             state = self.state_dict()

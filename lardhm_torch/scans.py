@@ -25,6 +25,7 @@ class Scans:
         target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; None: all 1.
         channels: values of the rays by name, such as color, intensity and class (`channels`); NaN,
             or -1 for a class, where a ray has none. None: no channels.
+        times: (S,) time stamp of each scan [s], NaN where it is not known; None: no scan has one.
 
     Raises:
         ValueError: a tensor has the wrong shape, a scan_id has no origin, or a value of a channel is
@@ -37,6 +38,7 @@ class Scans:
     is_return: Tensor = field(default=None)  # type: ignore[assignment]
     target_index: Tensor = field(default=None)  # type: ignore[assignment]
     channels: Channels = field(default=None)  # type: ignore[arg-type]
+    times: Tensor | None = None
 
     def __post_init__(self) -> None:
         ends = torch.as_tensor(self.ends, dtype=torch.float64)
@@ -74,6 +76,13 @@ class Scans:
         object.__setattr__(self, "origins", origins)
         object.__setattr__(self, "ends", ends)
         object.__setattr__(self, "channels", check_channels(self.channels, rays, device))
+        if self.times is not None:
+            times = torch.as_tensor(self.times, dtype=torch.float64, device=device)
+            if times.shape != (len(origins),):
+                raise ValueError(
+                    f"times must be ({len(origins)},), one per scan; got {tuple(times.shape)}"
+                )
+            object.__setattr__(self, "times", times)
 
     def __len__(self) -> int:
         """Number of rays R."""
@@ -114,7 +123,13 @@ class Scans:
             self.is_return[rays],
             self.target_index[rays],
             select_channels(self.channels, rays),
+            self.times,
         )
+
+    def with_origins(self, scans: Tensor, scan_id: Tensor) -> Scans:
+        """The same rays with the given scans (indices) alone, and their new numbers (R,)."""
+        times = None if self.times is None else self.times[scans]
+        return replace(self, origins=self.origins[scans], scan_id=scan_id, times=times)
 
     def drop_constant_column(self) -> Scans:
         """The same scans without the last coordinate, which must be constant, such as z of a 2-D log.
@@ -157,7 +172,16 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
         torch.cat([part.is_return for part in parts]),
         torch.cat([part.target_index for part in parts]),
         concatenate_channels([(part.channels, len(part)) for part in parts]),
+        _concatenate_times(parts),
     )
+
+
+def _concatenate_times(parts: list[Scans]) -> Tensor | None:
+    if all(part.times is None for part in parts):
+        return None
+    unknown = [torch.full_like(part.origins[:, 0], torch.nan) for part in parts]
+    pairs = zip(parts, unknown, strict=True)
+    return torch.cat([none if part.times is None else part.times for part, none in pairs])
 
 
 def every_scan(scans: Scans, step: int) -> Scans:
@@ -165,7 +189,7 @@ def every_scan(scans: Scans, step: int) -> Scans:
     kept = torch.arange(0, scans.num_scans, step, device=scans.ends.device)
     rays = scans.select(scans.scan_id % step == 0)
     scan_id = torch.div(rays.scan_id, step, rounding_mode="floor")
-    return replace(rays, origins=scans.origins[kept], scan_id=scan_id)
+    return rays.with_origins(kept, scan_id)
 
 
 def thin_rays(scans: Scans, voxel: float | None) -> Scans:

@@ -183,6 +183,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         num_clusters,
         seed=seed,
         channels=samples.channels,
+        time=None if scan.times is None or scan.times.isnan().any() else float(scan.times.max()),
         config=config.update,
     )
     if config.radius is not None:

@@ -69,6 +69,7 @@ def test_tf_places_the_clouds_by_all_frames_up_to_the_root(tmp_path, name):
     scans = load_scans(write_bag(tmp_path / name, messages))
     assert np.allclose(scans.ends, np.tile(points, (3, 1)), atol=1e-5)
     assert np.allclose(scans.origins, (MOUNT @ poses @ MOUNT)[:, :3, 3])
+    assert scans.times.tolist() == [10, 11, 12]
 
 
 @pytest.mark.parametrize("name", ONE_OF_EACH)

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from lardhm_torch.cli import learning, queries, tiling
+from lardhm_torch.cli.forgetting import add_forgetting
 from lardhm_torch.cli.map_size import add_hit_noise, add_map_size
 from lardhm_torch.cli.scan_arguments import add_ranges, add_reading, add_scans, finite
 
@@ -154,7 +155,7 @@ def _fit(sub: argparse.ArgumentParser) -> None:
         help="with --mcap or --rerun: z of the lowest and highest obstacles in the grid of a 3-D map "
         "[m]; without it there is no grid",
     )
-    _radius(sub)
+    add_forgetting(sub)
     add_ranges(sub)
     _dim(sub)
     _seed(sub)
@@ -171,7 +172,7 @@ def _update(sub: argparse.ArgumentParser) -> None:
     )
     text = "most clusters near a scan (default: chosen from the data)"
     sub.add_argument("--clusters", type=int, metavar="N", help=text)
-    _radius(sub)
+    add_forgetting(sub)
     add_ranges(sub)
     _seed(sub)
 
@@ -339,16 +340,6 @@ def _dim(sub: argparse.ArgumentParser) -> None:
         type=int,
         help="dimension of the map; 2 drops a constant last coordinate (default: that of the "
         "scans)",
-    )
-
-
-def _radius(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "--radius",
-        type=float,
-        metavar="METERS",
-        help="after each scan, remove clusters farther than this from the sensor (default: keep "
-        "all)",
     )
 
 

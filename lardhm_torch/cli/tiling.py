@@ -52,8 +52,8 @@ def update_folder(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--output must be omitted: {arguments.map} is updated in place")
     if arguments.min_range is not None or arguments.max_range is not None:
         raise ValueError("--min-range and --max-range were fixed by `lardhm tile`; omit them")
-    if arguments.clusters is not None or arguments.radius is not None:
-        raise ValueError("--clusters and --radius do not apply to tiled maps")
+    if any(v is not None for v in (arguments.clusters, arguments.radius, arguments.max_age)):
+        raise ValueError("--clusters, --radius and --max-age do not apply to tiled maps")
     dim = read_manifest(arguments.map).dim
     _, touched = add_scans(iter_pieces_of(arguments, dim), arguments.map, progress=True)
     manifest = fit_tiles(arguments.map, progress=True)

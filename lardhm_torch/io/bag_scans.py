@@ -190,6 +190,7 @@ def _readout(clouds: list[Cloud], poses: CloudPoses, notes: list[Note]) -> Reado
         is_return=_returns([clouds[i] for i in placed]),
         notes=(*notes, *poses.notes),
         channels=joined_columns([(clouds[i].channels, len(clouds[i].points)) for i in placed]),
+        scan_times=np.array([clouds[i].stamp for i in placed]),
     )
 
 

@@ -29,7 +29,7 @@ from lardhm_torch.io.atomic_files import replaced_file
 
 FORMAT_VERSION = 2
 # In the extra state of maps with channels or of packed maps, beside the settings.
-NOT_SETTINGS = ("channels", "class_scale", "is_packed")
+NOT_SETTINGS = ("channels", "class_scale", "is_packed", "max_age")
 STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
 SAFETENSORS = ".safetensors"
 MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it

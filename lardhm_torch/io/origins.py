@@ -154,6 +154,7 @@ def scans_from(readout: Readout, file: Path) -> Scans:
         "scan_id": readout.scan_id,
         "is_return": readout.is_return,
         "target_index": readout.target_index,
+        "times": readout.scan_times,
     }
     known = {name: torch.from_numpy(v) for name, v in columns.items() if v is not None}
     channels = {name: torch.from_numpy(v) for name, v in readout.channels.items()}

@@ -62,6 +62,7 @@ class _Frame:
     image: Path
     pose: NDArray[np.float64]  # (4, 4) world_from_camera
     color: Path | None = None
+    stamp: float = math.nan  # [s]
 
 
 def is_rgbd_folder(folder: Path) -> bool:
@@ -115,6 +116,7 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
             *_color_notes(frames, sum(map(bool, channels))),
         ),
         channels=joined_columns(list(zip(channels, counts, strict=True))),
+        scan_times=None if image_list is None else np.array([frame.stamp for frame in frames]),
     )
 
 
@@ -189,8 +191,8 @@ def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
     found, gaps = poses.at(np.array(stamps))
     colors = [a or b for a, b in zip(paired, listed_colors(folder, stamps), strict=True)]
     frames = [
-        _Frame(image, pose, color if color is not None and color.is_file() else None)
-        for image, pose, gap, color in zip(images, found, gaps, colors, strict=True)
+        _Frame(image, pose, color if color is not None and color.is_file() else None, stamp)
+        for image, pose, gap, color, stamp in zip(images, found, gaps, colors, stamps, strict=True)
         if gap <= MAX_STAMP_GAP
     ]
     return frames, len(images) - len(frames)

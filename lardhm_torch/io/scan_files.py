@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -235,7 +235,7 @@ def iter_scans(
                 used, scan_id = scan.scan_id.unique(return_inverse=True)
             else:
                 used, scan_id = torch.tensor([number]), torch.zeros_like(scan.scan_id)
-            yield replace(scan, origins=scans.origins[used], scan_id=scan_id)
+            yield scan.with_origins(used, scan_id)
 
 
 def iter_pieces(

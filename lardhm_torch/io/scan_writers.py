@@ -141,6 +141,8 @@ def save_scans(scans: Scans, path: str | os.PathLike[str]) -> None:
     arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
     channels = {name: value.cpu().numpy() for name, value in scans.channels.items()}
     if suffix == ".npz":
+        if scans.times is not None:
+            arrays["scan_times"] = scans.times.cpu().numpy()
         write_npz(target, arrays, channels)
     else:
         WRITERS[suffix](target, ray_columns(arrays, channels))

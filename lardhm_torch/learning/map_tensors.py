@@ -38,6 +38,7 @@ class MapTensors(nn.Module):
     losses: Tensor
     doubts: Tensor
     fresh: Tensor
+    times: Tensor
     posterior_means: Tensor
     posterior_variances: Tensor
     posterior_scales: Tensor
@@ -61,6 +62,9 @@ class MapTensors(nn.Module):
         self.num_neighbors = num_neighbors
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
+        self.max_age: float | None = (
+            None  # [s] clusters not seen for longer are removed by `update`
+        )
         self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
         with normal_tensors():
             self._register_empty(dim, device, dtype)
@@ -98,6 +102,7 @@ class MapTensors(nn.Module):
             "losses": weights.new_zeros(0),
             "doubts": weights.new_zeros(0),
             "fresh": weights.new_zeros(0),
+            "times": weights.new_zeros(0, dtype=torch.float64),
             "posterior_means": weights.new_zeros(0),
             "posterior_variances": weights.new_zeros(0),
             "posterior_scales": weights.new_ones(2),
@@ -142,8 +147,9 @@ class MapTensors(nn.Module):
         yield from self.named_buffers(recurse=False)
 
     def _apply(self: AnyTensors, fn: Any, recurse: bool = True) -> AnyTensors:
-        """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""
-        exact = {"origin": self.origin, "channel_sums": self.channel_sums}
+        """Cast all tensors except origin, times and channel sums: they remain float64 (`.to()`, ...)."""
+        names = ("origin", "times", "channel_sums")
+        exact = {name: getattr(self, name) for name in names}
         with self.lock.writing(), normal_tensors():
             super()._apply(fn, recurse)
             for name, tensor in exact.items():

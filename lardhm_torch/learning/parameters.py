@@ -16,7 +16,7 @@ from lardhm_torch.learning.channel_sums import Layout
 from lardhm_torch.learning.map_state import CHANNELS, MapState, no_channels
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
-from lardhm_torch.learning.state_checks import check_reach
+from lardhm_torch.learning.state_checks import check_max_age, check_reach
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
@@ -86,6 +86,8 @@ class MapParameters(MapTensors):
         state = {"format_version": map_files.FORMAT_VERSION, **self.settings}
         if self.is_packed:
             state["is_packed"] = True
+        if self.max_age is not None:
+            state["max_age"] = self.max_age
         if self.channel_layout:
             state |= {"channels": self.channel_layout, "class_scale": self.class_scale}
         return state
@@ -93,6 +95,8 @@ class MapParameters(MapTensors):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Whether the map is packed; `make_room` has already checked that the settings agree."""
         self.is_packed = bool(state.get("is_packed", False))
+        check_max_age(state.get("max_age"))
+        self.max_age = state.get("max_age")
 
     def check_learns(self) -> None:
         """Raise a ValueError if the map is packed: it has lost what learning continues from."""

@@ -37,6 +37,15 @@ def check_settings(
         )
 
 
+def check_max_age(max_age: float | None) -> None:
+    """Raise a ValueError if ``max_age`` is neither None nor a time [s] above 0."""
+    if max_age is None:
+        return
+    number = isinstance(max_age, (int, float)) and not isinstance(max_age, bool)
+    if not number or not 0 < max_age < math.inf:
+        raise ValueError(f"max_age must be > 0 s and finite, or None; got {max_age!r}")
+
+
 def check_values(tensors: Mapping[str, Tensor]) -> None:
     """Raise a ValueError if a value of a map's tensors is impossible; the message names the tensor.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from lardhm_torch.channels import CLASS
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
-from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
+from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence, no_times
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import resize, set_channels
 from lardhm_torch.learning.state_checks import check_values
@@ -104,8 +104,9 @@ def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
         return
     for name in HISTORY:
         if len(state.get(prefix + name, ())) == 0:
-            rows = centers.new_zeros(len(centers))
-            state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
+            zeros = centers.new_zeros(len(centers))
+            empty = {"evidence": no_evidence(centers), "times": no_times(zeros)}
+            state[prefix + name] = empty.get(name, zeros)
 
 
 def drop_spare_rows(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:
