@@ -9,6 +9,7 @@ scan than its own hits do.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -53,26 +54,7 @@ def scan_disagreement(scans: Scans, *, seed: int = 0) -> float:
         The disagreement, for ``FitConfig(hit_noise=...)``; 0 if there is only one scan, or if none is
         significant on the flat surfaces that scans have in common.
     """
-    config = SamplingConfig()
-    is_hit = usable_rays(scans, config)[0] & scans.is_return & (scans.ranges <= config.max_range)
-    rays = is_hit.nonzero().squeeze(1)
-    numbers = scans.scan_id[rays].unique()
-    numbers = numbers[:: -(-max(1, len(numbers)) // MOST_SCANS)]
-    count = min(len(rays), MOST_HITS // max(1, len(numbers)))
-    rng = seeded_generator(seed, "disagreement", rays.device)
-    found, begin = [], 0
-    for number in numbers:
-        own = rays[scans.scan_id[rays] == number]
-        others = rays[spread_rows(len(rays), count, rng)]
-        others = others[scans.scan_id[others] != number]
-        if len(own) < 2 * PATCH_HITS or len(others) == 0:
-            continue
-        own = own[torch.randperm(len(own), generator=rng, device=rng.device)]
-        corner = scans.origins[number]
-        patches = find_patches(scans.ends[own[::2]] - corner)
-        pair = [patch_offsets(scans, part, corner, patches) for part in (own[1::2], others)]
-        found.append([part._replace(patches=part.patches + begin) for part in pair])
-        begin += len(patches.means)
+    found = list(_compared(scans, seeded_generator(seed, "disagreement", scans.ends.device)))
     if not found:
         return 0.0
     same, cross = (
@@ -84,6 +66,28 @@ def scan_disagreement(scans: Scans, *, seed: int = 0) -> float:
     if apart - noise <= 2 * doubt:
         return 0.0
     return DEVIATIONS_PER_MEDIAN * math.sqrt(apart**2 - noise**2)
+
+
+def _compared(scans: Scans, rng: torch.Generator) -> Iterator[list[Offsets]]:
+    """Of some scans: offsets from their patches, of their own other hits and of hits of other scans."""
+    config = SamplingConfig()
+    is_hit = usable_rays(scans, config)[0] & scans.is_return & (scans.ranges <= config.max_range)
+    rays = is_hit.nonzero().squeeze(1)
+    numbers = scans.scan_id[rays].unique()
+    numbers = numbers[:: -(-max(1, len(numbers)) // MOST_SCANS)]
+    count, begin = min(len(rays), MOST_HITS // max(1, len(numbers))), 0
+    for number in numbers:
+        own = rays[scans.scan_id[rays] == number]
+        others = rays[spread_rows(len(rays), count, rng)]
+        others = others[scans.scan_id[others] != number]
+        if len(own) < 2 * PATCH_HITS or len(others) == 0:
+            continue
+        own = own[torch.randperm(len(own), generator=rng, device=rng.device)]
+        origin = scans.origins[number]
+        patches = find_patches(scans.ends[own[::2]] - origin)
+        pair = [patch_offsets(scans, part, origin, patches) for part in (own[1::2], others)]
+        yield [part._replace(patches=part.patches + begin) for part in pair]
+        begin += len(patches.means)
 
 
 def patch_offsets(scans: Scans, rays: Tensor, origin: Tensor, patches: Patches) -> Offsets:
