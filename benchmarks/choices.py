@@ -39,8 +39,8 @@ Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
 
 HEAD = """# Ablation study
 
-Balanced accuracy unif / near in percent, and log-loss unif / near, with one change at a time; at most
-{rays:,} rays of a set, half of which train, seed {seed}. The defaults were chosen on these sets.
+Balanced accuracy unif / near in percent, and log-loss unif / near. Each row changes one default. At most
+{rays:,} rays of a set, half of them for training, seed {seed}. The defaults were chosen on these sets.
 Produced by `benchmarks/choices.py`.
 
 """
@@ -88,7 +88,7 @@ CHOICES = {
     "one cluster per 30 hits": Choice(hits_per_cluster=30),
     "no near samples": Choice(sampling={"near_samples": 0}),
     "1 near sample": Choice(sampling={"near_samples": 1}),
-    "3 free samples a ray": Choice(sampling={"free_samples": 3}),
+    "3 free samples per ray": Choice(sampling={"free_samples": 3}),
     "near margin 0.2 m": Choice(sampling={"near_margin": 0.2}),
     "near margin 0.05 m": Choice(sampling={"near_margin": 0.05}),
     "equal class weights": Choice(fit={"occupied_share": 0.5}, tune={"occupied_share": 0.5}),
