@@ -13,7 +13,7 @@ from lardhm_torch import cli
 HERE = Path(__file__).parent
 EXIT_CODES = (
     "Exit code: 0 on success; 1 after an error, which is reported in one line; "
-    "2 for an invalid command line."
+    "2 for an invalid command line; 130 after Ctrl-C."
 )
 project = "lardhm_torch"
 author = "The lardhm_torch developers"
