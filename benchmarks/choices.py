@@ -35,7 +35,7 @@ from lardhm_torch import (
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.learning.fitting import fit_weights
 
-Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
+Kernel = Callable[[Tensor], Tensor]  # distance in length scales -> closeness
 
 HEAD = """# Ablation study
 
@@ -64,7 +64,7 @@ def matern_three_halves(d: Tensor) -> Tensor:
 
 
 def wendland(d: Tensor) -> Tensor:
-    """Compactly supported, twice differentiable; 0 beyond 3.5 length-scales."""
+    """Compactly supported, twice differentiable; 0 beyond 3.5 length scales."""
     r = (d / 3.5).clamp(max=1)
     return (1 - r) ** 4 * (4 * r + 1)
 
@@ -97,7 +97,7 @@ CHOICES = {
     "no stiffness": Choice(tune={"stiffness": 0.0}),
     "8 epochs": Choice(tune={"epochs": 8}),
     "best epoch on 10 % of the rays": Choice(tune={"hold_out": 0.1}),
-    "length-scales frozen": Choice(tune={"tune_scales": False}),
+    "length scales frozen": Choice(tune={"tune_scales": False}),
     "centers frozen": Choice(tune={"tune_centers": False}),
     "**default, not fine-tuned**": Choice(tune=None),
     "k = 8, not fine-tuned": Choice(model={"num_neighbors": 8}, tune=None),

@@ -37,11 +37,12 @@ from lardhm_torch.scans import seeded_generator
 class LardHilbertMap(MapQueries):
     """Continuous occupancy map whose log-odds are a weighted sum of local kernel features.
 
-    The probability is exactly 1/2 in an empty map and far from all clusters. Points are
-    given in the world frame; ``origin`` is subtracted in float64 before they are cast to the map's
-    dtype, so coordinates may be far from zero. Maps of half precision answer in their dtype and compute
-    in float32; they cannot be trained. A point with a NaN or infinite coordinate has
-    probability NaN. Tensors, NumPy arrays and lists are accepted as points.
+    The log-odds are the logit of the probability of occupancy. The probability is exactly 1/2 in an
+    empty map and far from all clusters. Points are given in the world frame; ``origin`` is subtracted
+    in float64 before they are cast to the map's dtype, so coordinates may be far from zero. Maps of
+    half precision compute in float32 and return results in their own dtype; they cannot be trained. A
+    point with a NaN or infinite coordinate has probability NaN. Tensors, NumPy arrays and lists are
+    accepted as points.
 
     Args:
         dim: number of coordinates D.
@@ -56,17 +57,17 @@ class LardHilbertMap(MapQueries):
         weights: (M,) parameter, weights of the features.
         centers: (M, D) parameter [m], map frame.
         raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with log-transformed diagonals, so
-            that any value is valid. `scale_tril` holds the factors of the kernels [m].
+            that any value is valid. `scale_tril` has the factors of the kernels [m].
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
             clusters of unknown points have count 0.
-        evidence: (M, 32, D) buffer [m], points kept by the clusters, padded with infinity.
+        evidence: (M, 32, D) buffer [m], kept points: a bounded random sample of the points of each
+            cluster, padded with infinity.
         losses, doubts, fresh: (M,) buffers, used by `update` (see docs).
         posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; a variance
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
-        channel_sums: (M, R, 1 + D) float64 buffer of a map that was given channels, else None; what
-            `channels` shows by name.
+        channel_sums: (M, R, 1 + D) float64 buffer of a map with channels, else None; see `channels`.
         class_weights: (M, K) parameter of a map whose classes were trained (`fit_classes`), else None.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
@@ -85,24 +86,25 @@ class LardHilbertMap(MapQueries):
         progress: bool = False,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
-        """Fit the map to labelled points. Existing clusters are discarded.
+        """Fit the map to labeled points. Existing clusters are discarded.
 
-        Each class is clustered separately. The moments of the clusters determine centers and
-        length-scales, and then the weights are trained. With ``max_bytes`` or
-        ``FitConfig(shape_passes=4)`` centers and length-scales of fewer clusters are trained, too
-        (`scene_clusters`). If anything fails, the map is unchanged.
+        Occupied, free and unknown points are clustered separately. The mean and covariance of the
+        points of a cluster determine its center and length scales. Then the weights are trained. With
+        ``max_bytes`` or ``FitConfig(shape_passes=4)``, the map has fewer clusters, and their centers
+        and length scales are trained, too (`scene_clusters`). If anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
-            num_clusters: total over both classes, half each; a class too small for its half
-                leaves the remainder to the other. None: chosen from the data
+            num_clusters: total over all classes, divided 1 : 2 : 1 between occupied, free and unknown
+                points, or 1 : 1 without unknown points. If a class has too few points, the other
+                classes get the remainder. None: chosen from the data
                 (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
             seed: random seed of clustering and training.
-            max_bytes: instead of a number of clusters, the size of the file that `pack` writes: the map
-                gets as many clusters as fit into it.
-            channels: values of the points by name, such as `Samples.channels`; those of the occupied
-                points are summed up in the clusters. They do not change the occupancy.
+            max_bytes: maximum size of the file that `pack` writes; the map gets as many clusters as fit
+                into it. An alternative to ``num_clusters``.
+            channels: additional values of the points by name, such as `Samples.channels`; the clusters
+                accumulate those of the occupied points. They do not affect the occupancy.
             progress: show a progress bar on a terminal.
             config: training settings.
 
@@ -110,7 +112,7 @@ class LardHilbertMap(MapQueries):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points,
+            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, no points,
                 num_clusters is not a positive integer, max_bytes is too small or given together with
                 num_clusters, or a channel is invalid.
 
@@ -148,10 +150,10 @@ class LardHilbertMap(MapQueries):
         wrong_labels: float = 0.0,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
-        """Train ``class_weights`` on labelled points by the multinomial log-loss.
+        """Train ``class_weights`` on labeled points with the multinomial log-loss.
 
         An empty map becomes a multi-class Hilbert map without occupancy: the points of each class are
-        clustered apart, in any dimension and unit, and the probability of occupancy stays 1/2. A
+        clustered separately, in any dimension and unit, and the probability of occupancy stays 1/2. A
         fitted map without classes first gets the class counts of the points. Occupancy and clusters
         of a fitted map do not change. If anything fails, the map is unchanged.
 
@@ -161,7 +163,7 @@ class LardHilbertMap(MapQueries):
             num_clusters: number of clusters of an empty map; None: one per 30 points of a class.
             seed: random seed of clustering and training.
             wrong_labels: fraction of the labels that are those of a random other class. The map then
-                answers for the true class.
+                predicts the true class instead of the label.
             config: training settings.
 
         Returns:
@@ -204,11 +206,12 @@ class LardHilbertMap(MapQueries):
     def calibrate_classes(
         self, points: TensorLike, classes: TensorLike, *, wrong_labels: float = 0.0
     ) -> LardHilbertMap:
-        """Set ``class_scale``, the factor on the class log-odds, to the most likely one for some labels.
+        """Fit ``class_scale``, the factor on the class log-odds, to labels by maximum likelihood.
 
-        The counts of a cluster answer for a random one of its labels. If a few of them are wrong, they
-        are too cautious about its true class. The factor changes confidences, and no most likely
-        class. Use points that the map has not seen, such as the next scan before it is added.
+        The class counts of a cluster give the distribution of a random one of its labels. If a few
+        labels are wrong, this is underconfident about the true class. The factor changes the
+        confidence, but not which class is most likely. Use points on which the map was not trained,
+        such as those of the next scan before it is added.
 
         Args:
             points: (N, D) world positions on surfaces [m].
@@ -241,7 +244,7 @@ class LardHilbertMap(MapQueries):
 
         Args:
             points: (N, D) world positions [m].
-            labels: (N,) 1 occupied, 0 free.
+            labels: (N,) 1 occupied, 0 free; unknown points (1/2) are left out.
 
         Returns:
             This map.
@@ -269,10 +272,11 @@ class LardHilbertMap(MapQueries):
         channels: Channels | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
-        """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
+        """Update the map with one more scan. On an empty map this is `fit`.
 
-        Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
-        near them are regrouped, and the weights there are trained on the kept points. Parameters
+        Each cluster keeps a bounded random sample of its points, the kept points. New points are added
+        to the sample, clusters near the new points are regrouped, and their weights are trained on the
+        kept points. Obstacles that the scan contradicts disappear after a few scans. Parameters
         remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
         without points are removed, and the last rows take their places. If anything fails, the map
         is unchanged.
@@ -284,14 +288,15 @@ class LardHilbertMap(MapQueries):
                 from the number of hits there.
             seed: random seed of clustering and training.
             channels: see `fit`; channels and classes that are new to the map are added to it.
-            config: update settings; `UpdateConfig(as_in_paper=True)` follows the paper.
+            config: update settings; `UpdateConfig(as_in_paper=True)` selects Algorithm 2 of the paper.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, num_clusters is not a
-                positive integer, or a channel is invalid or of another width than in the map.
+            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1,
+                num_clusters is not a positive integer, or a channel is invalid or has another number of
+                values than in the map.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
@@ -340,8 +345,8 @@ class LardHilbertMap(MapQueries):
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
-        Clusters of surfaces and of unknown space that limit the remaining free space stay, so that
-        places beyond the radius do not become free. The posterior of the other weights is kept.
+        Clusters of surfaces and of unknown space that limit the remaining free space are kept, so that
+        space beyond the radius does not become free. The posterior of the other weights is kept.
 
         Returns:
             This map.
@@ -362,8 +367,8 @@ class LardHilbertMap(MapQueries):
 
         Args:
             path: file; the extension ``.safetensors`` selects that format.
-            evidence: write the points kept by the clusters, too. Without them the file is about a
-                quarter as large, and a later `update` draws points from the clusters' moments.
+            evidence: also write the kept points of the clusters. Without them the file is about a
+                quarter as large, and a later `update` draws points from the Gaussians of the clusters.
         """
         with self.lock.reading():
             state = self.state_dict()
@@ -372,9 +377,9 @@ class LardHilbertMap(MapQueries):
             map_files.save_state(occupied_sums(state), path)
 
     def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:
-        """Write a small file, about 12 bytes per cluster in 3-D, of a map that answers but cannot learn.
+        """Write a compact file, about 12 bytes per cluster in 3-D, for queries only.
 
-        Channels take about 10 more bytes for each color of an occupied cluster.
+        A packed map cannot be trained or updated. Colors take about 10 more bytes per occupied cluster.
 
         Args:
             path: file, usually ``.lhm``.

@@ -155,5 +155,5 @@ def test_packed_maps_do_not_learn_classes(tmp_path):
     LardHilbertMap(2).fit_classes(points, classes).pack(tmp_path / "map.lhm")
     model = LardHilbertMap.load(tmp_path / "map.lhm")
     for change in (model.fit_classes, model.calibrate_classes):
-        with pytest.raises(ValueError, match="a packed map answers but does not learn"):
+        with pytest.raises(ValueError, match="a packed map supports queries, but no training"):
             change(points, classes)

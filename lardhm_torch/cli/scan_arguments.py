@@ -63,7 +63,9 @@ def add_reading(sub: argparse.ArgumentParser) -> None:
     )
     _add_depth_images(sub)
     sub.add_argument(
-        "--strict", action="store_true", help="report an error instead of guessing what a file means"
+        "--strict",
+        action="store_true",
+        help="report an error instead of guessing what a file means",
     )
 
 

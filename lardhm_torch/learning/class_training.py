@@ -1,4 +1,4 @@
-"""Multi-class Hilbert maps: clusters of labelled points of any kind, and weights of the classes.
+"""Multi-class Hilbert maps: clusters of labeled points of any kind, and weights of the classes.
 
 The log-odds of class k are those of the class counts around a point plus sum_m phi_m(x) V_mk. The class
 weights V (M, K) minimize the multinomial log-loss as the weights of the occupancy minimize the binary
@@ -99,7 +99,7 @@ def clustered(
     Args:
         labelled: N points; one with probabilities belongs to its most likely class.
         num_clusters: total, divided in proportion to the points; None: one per 30 points of a class.
-        kernel: minimum length-scale.
+        kernel: minimum length scale.
         like: (M, D) tensor of the map.
         rng: random generator.
 

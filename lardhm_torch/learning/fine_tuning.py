@@ -1,4 +1,4 @@
-"""Joint optimization of length-scales, centers and weights by backpropagation."""
+"""Joint optimization of length scales, centers and weights by backpropagation."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def fine_tune(
     progress: bool = False,
     config: TuneConfig | None = None,
 ) -> list[float]:
-    """Optimize centers, length-scales and weights of a fitted map on the balanced log-loss.
+    """Optimize centers, length scales and weights of a fitted map on the balanced log-loss.
 
     The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
-    of centers are in units of the mean length-scale of their cluster, and the diagonals of factors
+    of centers are in units of the mean length scale of their cluster, and the diagonals of factors
     are optimized as logarithms. Learning rates are therefore independent of the scene, and every
     factor remains valid. In each epoch the neighbors are searched once and the points passed several
     times, in groups, so that memory for neighbors does not grow with the number of points. With
@@ -179,10 +179,10 @@ class TuneConfig:
     passes: int = 3  # over the samples of an epoch
     batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
-    center_rate: float = 0.02  # per step, relative to the mean length-scale of the cluster
-    scale_rate: float = 0.02  # per step, of the logarithm of the length-scales
+    center_rate: float = 0.02  # per step, relative to the mean length scale of the cluster
+    scale_rate: float = 0.02  # per step, of the logarithm of the length scales
     l2: float = 0.25  # penalty on squared weights
-    stiffness: float = 0.8  # penalty on squared offsets of centers and length-scales
+    stiffness: float = 0.8  # penalty on squared offsets of centers and length scales
     occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`
     hold_out: float = 0.0  # fraction of rays used to select the best epoch; 0: keep the last
     patience: int | None = None  # stop after this many epochs without improvement
@@ -223,7 +223,7 @@ def tuned_table(start: Tensor, config: TuneConfig, kernel: Kernel) -> Table:
     size = raw.diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
     size = kernel.covariance_scale**0.5 * size.clamp(min=kernel.min_lengthscale)
     eye = torch.eye(dim, dtype=torch.bool, device=size.device)
-    unit = to_rows(  # size: (M, 1) mean length-scale of the kernels [m]
+    unit = to_rows(  # size: (M, 1) mean length scale of the kernels [m]
         torch.ones_like(size[:, 0]),
         size.expand(-1, dim),
         torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),

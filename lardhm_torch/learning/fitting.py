@@ -46,7 +46,7 @@ class FitConfig:
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # loss of unknown points, relative to all others
     # 0: the number of clusters is chosen from the points, and the weights are trained. 4: the scene
-    # decides on the number (`scene_clusters`), and so many passes train centers and length-scales, too.
+    # decides on the number (`scene_clusters`), and so many passes train centers and length scales, too.
     # A third of the clusters then answers points as well, but ranges and meshes are less exact.
     shape_passes: int = 0
 
