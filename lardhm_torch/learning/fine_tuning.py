@@ -57,11 +57,11 @@ def fine_tune(
     The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
     of centers are in units of the mean length scale of their cluster, and the diagonals of factors
     are optimized as logarithms. Learning rates are therefore independent of the scene, and every
-    factor remains valid. In each epoch the neighbors are searched once and the points passed several
-    times, in groups, so that memory for neighbors does not grow with the number of points. With
-    ``hold_out``, a fraction of the rays is excluded from training, and the parameters of the epoch
-    with the smallest loss on them are kept. The initial map is not a candidate, because `fit` has
-    used those rays. If anything fails, the map is unchanged.
+    factor remains valid. In each epoch the neighbors are searched once, and several passes over the
+    points are made in groups, so that the memory for neighbors does not grow with the number of
+    points. With ``hold_out``, a fraction of the rays is excluded from training, and the parameters of
+    the epoch with the smallest loss on them are kept. The initial map is not a candidate, because
+    `fit` has used those rays. If anything fails, the map is unchanged.
 
     Args:
         model: a fitted map, changed in place.
@@ -116,9 +116,7 @@ def _check_task(model: MapParameters, config: TuneConfig, rays_are_unknown: bool
     if not (config.tune_weights or config.tune_centers or config.tune_scales):
         raise ValueError("config must leave weights, centers or scales to tune; it freezes all")
     if config.hold_out and rays_are_unknown:
-        raise ValueError(
-            "ray_id must be given where held-out rays are to be sampled anew; got none"
-        )
+        raise ValueError("ray_id must be given if held-out rays are sampled again; got none")
 
 
 def _check(
@@ -175,12 +173,12 @@ class TuneConfig:
     ``l2`` and ``stiffness`` are relative to the summed loss of all points.
     """
 
-    epochs: int = 4  # with new neighbors, and new samples where they are drawn anew
-    passes: int = 3  # over the samples of an epoch
+    epochs: int = 4  # number of epochs; neighbors, and samples with ``resample``, are new in each
+    passes: int = 3  # passes over the samples in each epoch
     batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
-    center_rate: float = 0.02  # per step, relative to the mean length scale of the cluster
-    scale_rate: float = 0.02  # per step, of the logarithm of the length scales
+    center_rate: float = 0.02  # learning rate of centers, relative to the mean length scale
+    scale_rate: float = 0.02  # learning rate of the logarithm of the length scales
     l2: float = 0.25  # penalty on squared weights
     stiffness: float = 0.8  # penalty on squared offsets of centers and length scales
     occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`

@@ -45,10 +45,10 @@ class UpdateConfig:
     """Settings of an incremental update."""
 
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
-    zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
-    split_loss: float = 0.01  # clusters whose points have a larger mean loss are divided
-    max_points: int = 20_000  # new points of each class that are used; more are drawn at random
-    max_trained: int = 8_000  # changed clusters that are trained; the others follow later
+    zeta: float = 1.0  # [m] maximum distance between merged clusters in Algorithm 2
+    split_loss: float = 0.01  # clusters whose points have a larger mean log-loss are divided
+    max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
+    max_trained: int = 8_000  # maximum number of changed clusters to train; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
