@@ -32,12 +32,12 @@ _NO_DEPTH = (0, 65535)
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """Camera of a folder of depth images, where the folder does not contain it.
+    """Settings of the camera of a folder of depth images.
 
     Args:
         intrinsics: fx, fy, cx, cy of the pinhole [pixels], lens distortion removed; None: a file
             camera-intrinsics.txt beside the images.
-        pixel_step: every how many pixels of a row and of a column are read; 1: all of them.
+        pixel_step: step between the rows and columns that are read; 1: read all pixels.
         depth_scale: units of the images per meter; None: 1000 in the 7-Scenes layout, 5000 in
             TUM's.
     """
