@@ -241,7 +241,7 @@ def test_rows_that_inflate_to_something_else_are_refused(path):
     for body in (b"", b"no zlib", zlib.compress(bytes(10**6)), zlib.compress(b"") + b"more"):
         head = content[:16] + struct.pack("<I", len(body)) + content[20:84]
         path.write_bytes(resealed(head + body))
-        with pytest.raises(ValueError, match=r"map\.lhm must be a packed map, whole; "):
+        with pytest.raises(ValueError, match=r"map\.lhm must be a complete packed map; "):
             LardHilbertMap.load(path)
 
 

@@ -29,7 +29,7 @@ class BagParts:
 
     Args:
         files: the files to read.
-        num_messages: how many messages metadata.yaml promises; None if it does not say.
+        num_messages: how many messages metadata.yaml declares; None if it gives none.
         notes: what was assumed or left out.
     """
 

@@ -66,8 +66,8 @@ def _as_written(readout: Readout, file: Path) -> Readout:
         return seen_beams(readout)
     if np.abs(pose[:3, :3] - np.eye(3)).max() > _LEAST_ROTATION:
         raise ValueError(
-            "its pose (VIEWPOINT) rotates: the points may still be in the sensor frame. Say it: "
-            'frame="sensor" moves them by the pose, frame="world" leaves them and takes the '
+            "its pose (VIEWPOINT) has a rotation, so the points may be in the sensor frame. Choose: "
+            'frame="sensor" transforms them by the pose, frame="world" leaves them and takes the '
             "position alone; --frame on the command line"
         )
     readout = seen_beams(readout)
@@ -75,8 +75,8 @@ def _as_written(readout: Readout, file: Path) -> Readout:
     unused = "" if beside is None else f", and {beside.name} beside it is not used"
     return readout.noting(
         Note(
-            f"points taken to be in the world frame already{unused}",
-            cure='frame="world" confirms it, frame="sensor" moves them by the pose; --frame',
+            f"points assumed to be in the world frame{unused}",
+            cure='frame="world" confirms it, frame="sensor" transforms them by the pose; --frame',
         )
     )
 
@@ -91,7 +91,11 @@ def moved(readout: Readout, pose: FoundPose) -> Readout:
         ends=move_points(pose.world_from_sensor, readout.ends),
         origins=np.full((readout.num_scans, 3), pose.world_from_sensor[:3, 3]),
         origin_is_placeholder=False,
-        notes=(*readout.notes, *pose.notes, Note("points in the sensor frame, moved by the pose")),
+        notes=(
+            *readout.notes,
+            *pose.notes,
+            Note("points in the sensor frame, transformed by the pose"),
+        ),
     )
 
 

@@ -73,7 +73,9 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
     except Exception as error:
         # Damaged bytes raise a dozen exception types from pickle, zipfile, torch and safetensors.
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise ValueError(f"{path} must be a map file, whole and safe to load; {reason}") from error
+        raise ValueError(
+            f"{path} must be a complete map file that is safe to load; {reason}"
+        ) from error
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
         raise ValueError(f"{path} must hold a state dict; got {type(state).__name__}")
     return state

@@ -51,7 +51,7 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
             mesh.export(partial, file_type=suffix[1:])
     if is_coarse and suffix == ".stl":
         warnings.warn(
-            f"STL holds float32, which moved vertices by up to {error:.2g} m; .ply does not",
+            f"STL stores float32, which moved vertices by up to {error:.2g} m; .ply does not",
             stacklevel=2,
         )
 

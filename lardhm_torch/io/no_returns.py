@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import Readout
 
-NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
+NO_RETURNS = "beams without return, assumed to be free up to the longest range of their scan"
 _LARGEST_MISFIT = 0.5  # of a step of the grid
 
 

@@ -1,4 +1,4 @@
-"""PCD: ascii, binary and binary_compressed; VIEWPOINT is where the sensor stood.
+"""PCD: ascii, binary and binary_compressed; VIEWPOINT is the sensor pose.
 
 Files do not state whether VIEWPOINT is the viewpoint of points in the world frame (la3dm) or the
 transform of points in the sensor frame (CloudCompare). ``frame="world"`` or
@@ -207,11 +207,11 @@ def _read_compressed(file: BinaryIO, header: _Header) -> Columns:
     packed, unpacked = int.from_bytes(sizes[:4], "little"), int.from_bytes(sizes[4:], "little")
     promised = header.count * record_size(header.fields)
     if len(sizes) < 8 or packed > bytes_left(file):
-        raise ValueError(f"{packed} compressed bytes are promised; got {bytes_left(file)}")
+        raise ValueError(f"{packed} compressed bytes are declared; got {bytes_left(file)}")
     if unpacked != promised or unpacked > _LZF_RATIO * packed:
         raise ValueError(
             f"{header.count} points need {promised} bytes; "
-            f"the file promises {unpacked} from {packed} compressed ones"
+            f"the file declares {unpacked} from {packed} compressed ones"
         )
     content, columns, offset = decompress_lzf(file.read(packed), unpacked), {}, 0
     for field in header.fields:

@@ -81,7 +81,7 @@ def check_class_points(points: TensorLike, classes: TensorLike, like: Tensor) ->
     rows = (~missing(values)).nonzero().squeeze(1)
     if len(points) and len(rows) == 0:
         raise ValueError(
-            f"classes must have a value for a point at least; all {len(points)} miss it"
+            f"classes must have a value for at least one point; all {len(points)} are missing"
         )
     points, _ = check_samples(points, torch.ones(len(points)), like.shape[1], like.device)
     return ClassPoints(*in_morton_order(points[rows], values[rows]))

@@ -346,7 +346,7 @@ class TuningRun:
     def load(self, state: State) -> None:
         """Resume from a state."""
         if state["config"] != asdict(self.config):
-            raise ValueError(f"state must be of this config; got one of {state['config']}")
+            raise ValueError(f"state must belong to this config; got {state['config']}")
         start = self.table.start
         if state["start"].shape != start.shape:
             raise ValueError(

@@ -189,5 +189,5 @@ def _load_packed(path: str | os.PathLike[str]) -> dict[str, Any]:
         if block is not None:
             state = with_packed_channels(state, *block, 1 << packed.precision)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{os.fspath(path)} must be a packed map, whole; {error}") from error
+        raise ValueError(f"{os.fspath(path)} must be a complete packed map; {error}") from error
     return state

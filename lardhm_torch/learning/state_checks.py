@@ -88,6 +88,6 @@ def check_reach(state: MapState, kernel: Kernel) -> None:
         raise ValueError(
             "clusters must be near the origin of the map for their size; got one of "
             f"{float(scales[worst]):.3g} m at {float(state.centers[worst]):.3g} m, which "
-            f"{str(state.centers.dtype).removeprefix('torch.')} cannot hold. Use a map in float64, or "
+            f"{str(state.centers.dtype).removeprefix('torch.')} cannot represent. Use a float64 map, or "
             "one map for each place"
         )

@@ -54,8 +54,8 @@ def _try_to_load() -> bool:
     except (OSError, RuntimeError, subprocess.SubprocessError) as error:
         reason = " ".join(f"{problem}, and {error}".split())[:400]
         warnings.warn(
-            f"the native kernel is not available, maps answer several times slower: {reason}. "
-            "LARDHM_NATIVE=0 silences this",
+            f"the native library is not available, so queries are several times slower: {reason}. "
+            "LARDHM_NATIVE=0 silences this warning",
             stacklevel=4,
         )
         return False
@@ -66,11 +66,11 @@ def _load_shipped() -> str | None:
     """Load what the installation ships; why that is not possible, or None."""
     library = shipped_library()
     if library is None:
-        return f"no compiled kernel is installed for {platform.system()} on {platform.machine()}"
+        return f"no compiled library is installed for {platform.system()} on {platform.machine()}"
     try:
         torch.ops.load_library(str(library))
     except OSError as error:
-        return f"the installed kernel does not load ({error})"
+        return f"the installed library does not load ({error})"
     return None
 
 

@@ -41,12 +41,12 @@ def cached_file(name: str, make: Callable[[Path], None]) -> Path:
             continue
         if problems:
             warnings.warn(
-                f"the kernel cache cannot be used: {'; '.join(problems)}. The compiled kernel is kept "
+                f"the library cache cannot be used: {'; '.join(problems)}. The compiled library is kept "
                 f"in {folder}; set LARDHM_CACHE to a folder of your own",
                 stacklevel=6,
             )
         return kept
-    raise OSError(f"no folder for the compiled kernel: {'; '.join(problems)}; set LARDHM_CACHE")
+    raise OSError(f"no folder for the compiled library: {'; '.join(problems)}; set LARDHM_CACHE")
 
 
 def check_private(path: Path) -> None:

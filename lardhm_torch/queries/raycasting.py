@@ -117,7 +117,7 @@ def unit_rays(
         raise ValueError(f"directions must be (R, {model.dim}); got {tuple(directions.shape)}")
     if tuple(origins.shape) not in (tuple(directions.shape), (model.dim,)):
         raise ValueError(
-            f"origins must be {tuple(directions.shape)} as the directions, or one ({model.dim},); "
+            f"origins must be {tuple(directions.shape)} like the directions, or one ({model.dim},); "
             f"got {tuple(origins.shape)}"
         )
     lengths = torch.linalg.vector_norm(directions, dim=1, keepdim=True)

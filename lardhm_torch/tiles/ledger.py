@@ -104,7 +104,7 @@ def read_ledger(folder: Folder) -> Ledger:
         channels = check_layout(body.get("channels", {}))
         return Ledger(**{**body, "tiles": tiles, "values": values, "channels": channels})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path} must be the ledger of a tiled map, whole; {error}") from error
+        raise ValueError(f"{path} must be the complete ledger of a tiled map; {error}") from error
 
 
 @contextmanager
@@ -121,7 +121,7 @@ def appending(folder: Folder, dim: int) -> Iterator[Ledger]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise ValueError(
-                f"{folder} must have one writer at a time; another process adds points to it"
+                f"{folder} must have one writer at a time; another process is adding points to it"
             ) from error
         try:
             yield _roll_back(folder, dim)
