@@ -20,7 +20,7 @@ from lardhm_torch.native.surfaces import NativeMap
 
 
 class MapQueries(parameters.MapParameters):
-    """What `LardHilbertMap` answers; see there."""
+    """The queries of `LardHilbertMap`; see there."""
 
     @reads_map
     def forward(self, points: TensorLike) -> Tensor:

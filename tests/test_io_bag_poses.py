@@ -106,7 +106,7 @@ def test_registered_clouds_are_seen_from_the_mount_on_poses_without_a_frame(tmp_
     assert_rays(load_scans(path, report=report), DRIVE, 2e-6)
     assert "sensor assumed to be at lidar (guess:" in str(report)
     path = write_bag(tmp_path / f"b{name}", lambda maker: messages(maker, ["lidar", "imu"]))
-    with pytest.warns(ScanFileWarning, match="sensor at the poses of /pose .*poses_frame says of"):
+    with pytest.warns(ScanFileWarning, match="sensor at the poses of /pose .*poses_frame names"):
         load_scans(path)
     scans = load_scans(path, poses_frame="base", sensor_frame="lidar", strict=True)
     assert_rays(scans, DRIVE, 2e-6)

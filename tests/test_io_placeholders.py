@@ -344,5 +344,5 @@ def test_a_pose_file_beside_an_e57_without_a_pose_is_used_when_the_frame_is_said
 
 def test_a_frame_is_refused_for_an_e57_with_poses(tmp_path):
     write_e57(tmp_path / "a.e57", [sensor_points()], None, [POSITION])
-    with pytest.raises(ValueError, match=r"a\.e57.*other formats say it themselves"):
+    with pytest.raises(ValueError, match=r"a\.e57.*other formats state their frame"):
         load_scans(tmp_path / "a.e57", frame="sensor")

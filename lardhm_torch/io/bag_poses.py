@@ -220,11 +220,11 @@ def _seen_by_topic(
 def _mount_below(
     sources: PoseSources, topic: PoseTopic, stamps: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Note]:
-    """Where the sensor sits in the frame that a topic of poses moves."""
+    """Pose of the sensor in the frame of a pose topic."""
     child = sources.poses_frame or topic.child or _only_base(sources.tree)
     nowhere = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps))
     if not child or child not in sources.tree.frames:
-        cure = f"poses_frame says of which frame {topic.name} is" if sources.tree.frames else ""
+        cure = f"poses_frame names the frame of {topic.name}" if sources.tree.frames else ""
         text = f"sensor at the poses of {topic.name}"
         return *nowhere, Note(text, cure=cure, is_loss=bool(cure))
     if sources.sensor_frame is None and not _sensors_below(sources.tree, child):
@@ -272,7 +272,7 @@ def _by_topic(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -> 
             notes.append(
                 Note(
                     f"{topic.name} does not name the frame of its poses: assumed to be {child}",
-                    cure=f"poses_frame='{child}' confirms it, poses_frame='{frame}' is without mount",
+                    cure=f"poses_frame='{child}' confirms it, poses_frame='{frame}' ignores the mount",
                 )
             )
     if child != frame:

@@ -24,17 +24,16 @@ def placed(
 ) -> Readout:
     """Points and origin by the file's pose: that of a pose file, or, in the sensor's frame, its own.
 
-    Without a frame points are left where they are, unless the file's own pose rotates.
+    Without a frame, points are left where they are, unless the file's own pose has a rotation.
 
     Raises:
-        ValueError: the format says its frame itself, or there is no pose for points of the sensor
-            frame.
+        ValueError: the format states its frame, or there is no pose for points in the sensor frame.
     """
     if frame is None:
         return _as_written(readout, file)
     if file.suffix.lower() not in _WITHOUT_FRAME and not _lacks_pose(readout, file):
         raise ValueError(
-            f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats say it themselves, '
+            f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats state their frame, '
             "unless a single scan of .e57 or .ptx has no pose"
         )
     pose = pose_beside(file, poses_frame)

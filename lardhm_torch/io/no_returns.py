@@ -89,6 +89,6 @@ def with_free_beams(readout: Readout, sensor: NDArray[np.float64]) -> Readout:
     longest = np.linalg.norm(points[~is_lost], axis=1).max()
     ends = readout.ends.copy()
     ends[is_beam] = sensor + longest * directions[is_beam]
-    cure = "a field is_return says it"
+    cure = "a field is_return specifies it"
     note = Note(NO_RETURNS, int(is_beam.sum()), cure=cure)
     return replace(readout, ends=ends, is_return=~is_beam).noting(note)

@@ -1,4 +1,4 @@
-"""What readers assumed about scan files, and how that is reported.
+"""Assumptions of readers about scan files, and how they are reported.
 
 Every reader attaches a few `Note`s to what it reads. The public functions collect them in a
 `ScanReport`, which prints as one line; ``strict=True`` turns every guess into an error.

@@ -45,8 +45,8 @@ def with_origins(
     wrong = _why_placeholder_is_wrong(readout, file, num_placeholders)
     if wrong:
         raise ValueError(
-            f"{file} must contain the sensor position. Its pose is the identity, which is what "
-            f"writers put when they know none, and {wrong}. {readout.origin_cure} or give it: "
+            f"{file} must contain the sensor position. Its pose is the identity, which many programs "
+            f"write if they have no pose, and {wrong}. {readout.origin_cure} or give it: "
             f"{_GIVE_IT}.{_hint(file)}"
         )
     zero = ",".join("0" * readout.dim)
@@ -69,7 +69,7 @@ def with_identities(readout: Readout, is_identity: NDArray[np.bool_]) -> Readout
     is_one = int(is_identity.sum()) == 1
     ends = readout.ends if readout.scan_id is None else readout.ends[readout.scan_id == scan]
     if is_one and _nearest(ends) <= FARTHEST_START:
-        cure = "the scan that the others are registered to; else export it with its pose"
+        cure = "if the others are registered to this scan; else export it with its pose"
         return readout.noting(
             Note(f"the identity pose of scan {scan} is assumed to be valid", cure=cure)
         )

@@ -2,10 +2,10 @@
 
 Files do not state whether VIEWPOINT is the viewpoint of points in the world frame (la3dm) or the
 transform of points in the sensor frame (CloudCompare). ``frame="world"`` or
-``frame="sensor"`` decides; without it a VIEWPOINT that only shifts is taken for a viewpoint, and one
-that rotates is refused (`frames.placed`). VIEWPOINT 0 0 0 1 0 0 0 is what PCL, Open3D and pypcd4
-write when they know no pose. A field ``is_return`` says which beams met nothing; else points of NaN
-in an organized cloud are such beams, if its grid is one of angles (`no_returns.with_free_beams`).
+``frame="sensor"`` decides; without it a VIEWPOINT without rotation is assumed to be a viewpoint, and one
+with a rotation is refused (`frames.placed`). PCL, Open3D and pypcd4 write VIEWPOINT 0 0 0 1 0 0 0 if they
+have no pose. A field ``is_return`` marks beams without return; otherwise points of NaN in an organized
+cloud are such beams, if its grid is one of angles (`no_returns.with_free_beams`).
 """
 
 from __future__ import annotations

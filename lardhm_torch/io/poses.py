@@ -175,7 +175,7 @@ def _by_line(file: PoseFile) -> Note:
     """The note for lines that were found by number."""
     steps = np.empty(0) if file.stamps is None else np.diff(file.stamps[np.isfinite(file.stamps)])
     if len(steps) > 1 and steps.max() > 2.5 * np.median(steps) and steps.min() > 0:
-        cure = "scans named by stamp settle it"
+        cure = "scans named by stamp avoid it"
         return Note("poses by line number (from 0), though stamps have a gap", cure=cure)
     return Note("poses by line number (from 0)")
 

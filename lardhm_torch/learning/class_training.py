@@ -1,9 +1,9 @@
 """Multi-class Hilbert maps: clusters of labeled points of any kind, and weights of the classes.
 
 The log-odds of class k are those of the class counts around a point plus sum_m phi_m(x) V_mk. The class
-weights V (M, K) minimize the multinomial log-loss as the weights of the occupancy minimize the binary
-one; the paper names this extension in its footnote 1. They begin at 0, so that a map without training
-answers by its counts.
+weights V (M, K) minimize the multinomial log-loss, as the weights of the occupancy minimize the binary
+one; the paper mentions this extension in its footnote 1. They are 0 before training, when the class
+counts alone determine the result.
 """
 
 from __future__ import annotations

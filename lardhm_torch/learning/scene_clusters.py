@@ -1,10 +1,10 @@
 """Maps with as many clusters as their scene needs.
 
-A coarse map of a sample of the points shows how hard the scene is: its log-loss on other points, summed
-over all points, is what clusters can still explain. The map gets one cluster for every
-`NATS_PER_PARAMETER` of this loss and parameter of a cluster. A large empty room needs few clusters,
-however many points it has; sparse scans of a street need thousands. Weights, centers and length scales
-are then trained together, so that few clusters are enough.
+A coarse map is trained on a sample of the points. Its log-loss on other points, scaled to all points,
+measures how much is still to be explained. The map gets one cluster for every `NATS_PER_PARAMETER` of
+this loss times the number of parameters of a cluster. A large empty room needs few clusters, even with
+many points; sparse scans of a street need thousands. Weights, centers and length scales are then trained
+together, so that few clusters are enough.
 """
 
 from __future__ import annotations

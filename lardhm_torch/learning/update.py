@@ -1,9 +1,9 @@
-"""Incremental update with one more scan: evidence, regrouping, and training where it changed.
+"""Incremental update with one more scan: evidence, regrouping, and training of changed clusters.
 
 A map keeps a bounded sample of the real points of each cluster (`evidence`). An update adds the points
-of a scan to it, drops what they contradict (`forgetting`), groups the changed points anew
-(`regrouping`) and trains the weights there on kept points with their labels (`retraining`). So the map
-is always trained on a sample of all that was seen. Algorithm 2 as printed is available, too.
+of a scan to it, reduces the weight of contradicted points (`forgetting`), regroups changed clusters
+(`regrouping`) and trains their weights on the kept points and their labels (`retraining`). So the map
+is always trained on a sample of all scans. Algorithm 2 of the paper is also available.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Load the kernel: the library that a wheel ships, else one compiled for this machine, else none.
+"""Load the native library: from the wheel, else compiled for this machine, else none.
 
-- Linux on x86-64: the wheel for this platform ships the kernel; the pure wheel compiles it.
+- Linux on x86-64: the wheel for this platform contains it; with the pure wheel it is compiled.
 - Linux on other processors, macOS: it is compiled on first use.
-- Windows, and wherever there is no compiler: the plain path, with one warning.
+- Windows, and systems without a compiler: plain torch is used, with one warning.
 
 Two libraries register the same operators, so a process loads one of them at most.
 """
@@ -30,10 +30,10 @@ _loaded: bool | None = None
 
 
 def available() -> bool:
-    """Whether the kernel can be used; the first call loads it, and compiles it if it must.
+    """Whether the native library can be used; the first call loads it, and compiles it if necessary.
 
-    ``LARDHM_NATIVE=0`` in the environment means no, silently; without a library that fits and a
-    compiler that works the answer is no, with one warning.
+    False without a warning if ``LARDHM_NATIVE=0`` is set in the environment; False with one warning if
+    there is neither a suitable library nor a working compiler.
     """
     global _loaded
     if _loaded is None:

@@ -1,7 +1,7 @@
 """Ray casting: distance to the first obstacle along each ray.
 
-This is the definition, in plain torch: it evaluates every step of every ray. The native kernel gives
-the same ranges and passes over cells of an octree in which no obstacle can be.
+This is the definition, in plain torch: it evaluates every step of every ray. The native library gives
+the same ranges, but skips cells of an octree that cannot contain an obstacle.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The ledger of a tiled folder: how many training points of each tile count.
+"""The ledger of a tiled folder: the number of valid training points of each tile.
 
-Files of training points only grow. Records behind those that the ledger counts were left by a
-killed run; the next writer truncates them. The files are not forced to the disk (that would take
-milliseconds for each tile): one that a power failure truncated is recognized by its size.
+Files of training points only grow. Records after the valid ones were left by a killed run; the next
+writer truncates them. The files are not synchronized to disk (that would take milliseconds for each
+tile): a file that was truncated by a power failure is recognized by its size.
 """
 
 from __future__ import annotations
