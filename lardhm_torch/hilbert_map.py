@@ -96,13 +96,11 @@ class LardHilbertMap(MapQueries):
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
-            num_clusters: total over all classes, divided 1 : 2 : 1 between occupied, free and unknown
-                points, or 1 : 1 without unknown points. If a class has too few points, the other
-                classes get the remainder. None: chosen from the data
-                (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
+            num_clusters: total, divided 1 : 2 : 1 between occupied, free and unknown points, or 1 : 1
+                without unknown points; other classes get what a class has too few points for. None:
+                chosen (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
             seed: random seed of clustering and training.
-            max_bytes: maximum size of the file that `pack` writes; the map gets as many clusters as fit
-                into it. An alternative to ``num_clusters``.
+            max_bytes: instead of ``num_clusters``, the maximum size of the file that `pack` writes.
             channels: additional values of the points by name, such as `Samples.channels`; the clusters
                 accumulate those of the occupied points. They do not affect the occupancy.
             progress: show a progress bar on a terminal.
@@ -208,10 +206,9 @@ class LardHilbertMap(MapQueries):
     ) -> LardHilbertMap:
         """Fit ``class_scale``, the factor on the class log-odds, to labels by maximum likelihood.
 
-        The class counts of a cluster give the distribution of a random one of its labels. If a few
-        labels are wrong, this is underconfident about the true class. The factor changes the
-        confidence, but not which class is most likely. Use points on which the map was not trained,
-        such as those of the next scan before it is added.
+        The class counts of a cluster give the distribution of its labels, which is underconfident about
+        the true class if a few labels are wrong. The factor does not change which class is most likely.
+        Use points on which the map was not trained, such as those of the next scan before it is added.
 
         Args:
             points: (N, D) world positions on surfaces [m].
@@ -275,11 +272,10 @@ class LardHilbertMap(MapQueries):
         """Update the map with one more scan. On an empty map this is `fit`.
 
         Each cluster keeps a bounded random sample of its points, the kept points. New points are added
-        to the sample, clusters near the new points are regrouped, and their weights are trained on the
-        kept points. Obstacles that the scan contradicts disappear after a few scans. Parameters
-        remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
-        without points are removed, and the last rows take their places. If anything fails, the map
-        is unchanged.
+        to it, clusters near the new points are regrouped, and their weights are trained on the kept
+        points. Obstacles that scans contradict disappear after a few updates. Parameters remain the
+        same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters without
+        points are removed, and the last rows take their places. If anything fails, nothing changes.
 
         Args:
             points: (N, D) world positions [m]; an empty set leaves the map unchanged.
@@ -294,9 +290,8 @@ class LardHilbertMap(MapQueries):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1,
-                num_clusters is not a positive integer, or a channel is invalid or has another number of
-                values than in the map.
+            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, num_clusters
+                is not a positive integer, or a channel is invalid or does not match that of the map.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """

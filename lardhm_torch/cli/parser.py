@@ -197,7 +197,7 @@ def _file_verbs(verb: Any) -> None:
         "--faces",
         type=int,
         metavar="N",
-        help="simplify the mesh to about N faces (default: no simplification)",
+        help="simplify the mesh to about N faces",
     )
 
     sub = verb(queries.grid)
@@ -216,24 +216,20 @@ def _file_verbs(verb: Any) -> None:
     )
     sub.add_argument("--channel", metavar="NAME", help="with .npz: also write this channel")
     sub.add_argument(
-        "--nav2",
-        metavar="FILE",
-        help="write a map for Nav2's map_server: a .yaml file, and an image beside it",
+        "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml and an image"
     )
     sub.add_argument(
         "--heights",
         nargs=2,
         type=finite,
         metavar=("LOW", "HIGH"),
-        help="with --nav2: lowest and highest z of obstacles in a 3-D map [m]; choose a lowest z above "
-        "the floor",
+        help="with --nav2: lowest and highest z of obstacles in a 3-D map [m], above the floor",
     )
     sub.add_argument(
         "--mode",
         choices=("trinary", "scale"),
         default="trinary",
-        help="with --nav2: trinary: cells are occupied, free or unknown; scale: known cells have a "
-        "probability (default: trinary)",
+        help="with --nav2: occupied, free and unknown cells, or probabilities (default: trinary)",
     )
 
     sub = verb(queries.pack)
@@ -258,9 +254,7 @@ def _picture_verbs(verb: Any) -> None:
         help="port to serve on; if it is in use, the next free one is used (default: 8080)",
     )
     sub.add_argument(
-        "--resolution",
-        type=float,
-        help="cell size of the surface [m] (default: chosen from the map)",
+        "--resolution", type=float, help="cell size of the surface [m] (default: automatic)"
     )
     sub.add_argument(
         "--export", metavar="FILE", help="write the scene to a .html or .viser file and exit"
@@ -270,10 +264,7 @@ def _picture_verbs(verb: Any) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
     _output(sub, "picture to write: .png")
     sub.add_argument(
-        "--slice",
-        type=finite,
-        metavar="Z",
-        help="draw the probability at height Z [m] instead of the surface",
+        "--slice", type=finite, metavar="Z", help="draw the probability at height Z [m]"
     )
     _resolution(sub, 0.05)
     _surface(sub)
