@@ -237,14 +237,18 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     """
     sizes = kept_counts(groups.evidence) + received
     alive = sizes >= (1 if rule.few else MIN_COUNT)
+    occupied = rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = groups.rows(kind)
         some = alive[own]
         if not bool(some.any()):
             some = sizes[own] > 0
-        limit = max(1, factor * rule.occupied, int((own < before).sum()))
+        if kind == 0 and rule.grows:
+            occupied = max(occupied, int(some.sum()))
+        added = int((own >= before).sum())
+        limit = max(1, factor * occupied, len(own) - added, added if rule.grows else 0)
         excess = int(some.sum()) - limit
-        if excess > 0 and not rule.grows:
+        if excess > 0:
             order = torch.where(some, sizes[own], sizes.amax() + 1).argsort(stable=True)
             some[order[:excess]] = False
         alive[own] = some
