@@ -68,7 +68,7 @@ def fine_tune(
         model: a fitted map, changed in place.
         points: (N, D) world positions [m].
         labels: (N,) 1 occupied, 0 free, 1/2 unknown. If there are unknown points, more are drawn in the
-            tails of the kernels in every epoch, as in `fit`, so kernels do not grow into unobserved space.
+            tails of the kernels in every epoch, as in `fit`, so kernels do not extend into unknown space.
         ray_id: (N,) ray of each point, so that complete rays are held out (`Samples.ray_id`);
             None: points are held out individually.
         resample: function that returns new samples of the same rays, given the number of the epoch
@@ -191,7 +191,7 @@ class TuneConfig:
     l2: float = 0.25  # penalty on squared weights
     stiffness: float = 0.8  # penalty on squared offsets of centers and length scales
     occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`
-    unknown_share: float = 0.1  # weight of the loss of unknown points, as in `FitConfig`; 0: omit them
+    unknown_share: float = 0.1  # relative loss of unknown points, see `FitConfig`; 0: omit them
     hold_out: float = 0.0  # fraction of rays used to select the best epoch; 0: keep the last
     patience: int | None = None  # stop after this many epochs without improvement
     tune_weights: bool = True
