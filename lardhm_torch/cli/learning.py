@@ -142,7 +142,7 @@ def _tune(
     state: dict[str, Any] | None,
     arguments: argparse.Namespace,
 ) -> None:
-    """Fine-tune with free points sampled anew in every epoch."""
+    """Fine-tune with free points sampled again in every epoch."""
     from lardhm_torch import fine_tune, sample_rays
     from lardhm_torch.io.map_files import save_state
 
@@ -265,7 +265,9 @@ def update(arguments: argparse.Namespace) -> None:
         update_folder(arguments)
         return
     if arguments.output is None:
-        raise ValueError("--output is required for a map file; only a tiled map needs none")
+        raise ValueError(
+            "--output is required for a map file; only a tiled map is updated in place"
+        )
     check_output(arguments.output, MAP_SUFFIXES, arguments.scans)
     from lardhm_torch import LardHilbertMap, StreamConfig, stream_scans
 
