@@ -146,7 +146,7 @@ def _tune(
     hit_noise: float,
     arguments: argparse.Namespace,
 ) -> None:
-    """Fine-tune with free points sampled anew in every epoch."""
+    """Fine-tune with free points sampled again in every epoch."""
     from lardhm_torch import TuneConfig, fine_tune, sample_rays
     from lardhm_torch.io.map_files import save_state
 
@@ -270,7 +270,9 @@ def update(arguments: argparse.Namespace) -> None:
         update_folder(arguments)
         return
     if arguments.output is None:
-        raise ValueError("--output is required for a map file; only a tiled map needs none")
+        raise ValueError(
+            "--output is required for a map file; only a tiled map is updated in place"
+        )
     check_output(arguments.output, MAP_SUFFIXES, arguments.scans)
     from lardhm_torch import LardHilbertMap, StreamConfig, stream_scans
 
