@@ -20,7 +20,7 @@ from lardhm_torch.native.crossings import PATCH_HITS, Patches, find_patches
 from lardhm_torch.sampling import SamplingConfig, spread_rows, usable_rays
 from lardhm_torch.scans import Scans, seeded_generator
 
-MOST_SCANS = 64  # scans whose patches are compared with the hits of others
+MOST_SCANS = 32  # scans whose patches are compared with the hits of others
 MOST_HITS = 200_000  # that are drawn for this, over all these scans
 WIDE = 0.3  # variances of a patch in its plane: the smaller relative to the larger, at least
 FAR = 0.5  # [m] farther from its plane, a hit lies on another surface
@@ -101,16 +101,22 @@ def patch_offsets(scans: Scans, rays: Tensor, origin: Tensor, patches: Patches) 
         origin: (D,) sensor position of the patches' scan [m], from which these are measured.
         patches: L patches.
     """
-    hits, sensors = scans.ends[rays] - origin, scans.origins[scans.scan_id[rays]] - origin
+    variances = torch.linalg.eigvalsh(patches.covariances)
+    is_plane = patches.is_flat & (variances[:, 1] > WIDE * variances[:, -1])
+    hits = scans.ends[rays] - origin
     owner = native.nearest_centers(hits, patches.means, 1).squeeze(1)
+    rows = is_plane[owner].nonzero().squeeze(1)
+    hits, owner, sensors = (
+        hits[rows],
+        owner[rows],
+        scans.origins[scans.scan_id[rays[rows]]] - origin,
+    )
     means, normals = patches.means[owner], patches.normals[owner]
     heights = ((hits - means) * normals).sum(dim=1)
     along = hits - means - heights[:, None] * normals
     squared = (along * (patches.precisions[owner] @ along[:, :, None]).squeeze(2)).sum(dim=1)
-    variances = torch.linalg.eigvalsh(patches.covariances)
-    is_plane = patches.is_flat & (variances[:, 1] > WIDE * variances[:, -1])
     sides = ((sensors - means) * normals).sum(dim=1) * -(means * normals).sum(dim=1)
-    kept = is_plane[owner] & (squared < 1) & (heights.abs() < FAR) & (sides > 0)
+    kept = (squared < 1) & (heights.abs() < FAR) & (sides > 0)
     return Offsets(heights[kept].abs(), owner[kept])
 
 
