@@ -15,7 +15,8 @@ from lardhm_torch.channels import Channels, check_channels, concatenate_channels
 class Scans:
     """Rays of one or more scans, in the world frame, as float64.
 
-    Ray r goes from ``origins[scan_id[r]]`` to ``ends[r]``. Coordinates may be far from zero (e.g. UTM).
+    Ray r starts at ``origins[scan_id[r]]`` and ends at ``ends[r]``. Coordinates may be far from zero
+    (e.g. UTM).
 
     Args:
         origins: (S, D) sensor position of each scan [m].
@@ -23,9 +24,9 @@ class Scans:
         scan_id: (R,) scan of each ray, 0 to S - 1; None: all rays belong to scan 0.
         is_return: (R,) True where the ray hit a surface; None: all rays did.
         target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; None: all 1.
-        channels: values of the rays by name, such as color, intensity and class (`channels`); NaN,
-            or -1 for a class, where a ray has none. None: no channels.
-        times: (S,) time stamp of each scan [s], NaN where it is not known; None: no scan has one.
+        channels: additional values of the rays by name, such as color, intensity and class (see
+            `channels`); a missing value is NaN, or -1 for a class. None: no channels.
+        times: (S,) time stamp of each scan [s], NaN if unknown; None: no scan has one.
 
     Raises:
         ValueError: a tensor has the wrong shape, a scan_id has no origin, or a value of a channel is
@@ -132,7 +133,7 @@ class Scans:
         return replace(self, origins=self.origins[scans], scan_id=scan_id, times=times)
 
     def drop_constant_column(self) -> Scans:
-        """The same scans without the last coordinate, which must be constant, such as z of a 2-D log.
+        """The same scans without the last coordinate, which must be constant, such as z of 2-D scans.
 
         Raises:
             ValueError: the last coordinate is not constant.
@@ -148,7 +149,7 @@ class Scans:
 
 
 def concatenate_scans(parts: list[Scans]) -> Scans:
-    """Concatenate the rays of several Scans. Scan numbers are renumbered consecutively.
+    """Concatenate the rays of several Scans. Scans are renumbered consecutively.
 
     Rays of a part without a channel have no value in it.
 
@@ -185,7 +186,7 @@ def _concatenate_times(parts: list[Scans]) -> Tensor | None:
 
 
 def every_scan(scans: Scans, step: int) -> Scans:
-    """Every ``step``-th scan, from the first on, numbered anew."""
+    """Every ``step``-th scan, starting with the first. Scans are renumbered."""
     kept = torch.arange(0, scans.num_scans, step, device=scans.ends.device)
     rays = scans.select(scans.scan_id % step == 0)
     scan_id = torch.div(rays.scan_id, step, rounding_mode="floor")
@@ -193,9 +194,9 @@ def every_scan(scans: Scans, step: int) -> Scans:
 
 
 def thin_rays(scans: Scans, voxel: float | None) -> Scans:
-    """The first of all rays of a scan that end in one voxel.
+    """Of the rays of a scan that end in one voxel, keep the first.
 
-    Hits and beams without return are thinned apart. Rays that are not finite are kept: sampling
+    Hits and beams without return are thinned separately. Non-finite rays are kept, because sampling
     counts them.
 
     Args:
@@ -249,10 +250,10 @@ def split_rays(scans: Scans, ratio: float = 0.5, seed: int = 0) -> tuple[Scans, 
 def seeded_generator(
     seed: int, purpose: str, device: torch.device | str = "cpu"
 ) -> torch.Generator:
-    """A generator whose numbers depend on the seed and on what they are for.
+    """A generator whose numbers depend on the seed and on their purpose.
 
-    Sampling, clustering and training with the same seed must not draw the same numbers: points
-    would be placed and chosen by one sequence.
+    Sampling, clustering and training with the same seed must not draw the same numbers, which would
+    be correlated otherwise.
 
     Args:
         seed: any integer.

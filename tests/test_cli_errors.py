@@ -20,7 +20,7 @@ def test_errors_are_one_line_and_old_files_stay(folder, capsys, tmp_path):
     (tmp_path / "broken.pt").write_bytes(b"not a map")
     (tmp_path / "old.npy").write_bytes(b"old")
     message = fails(capsys, "info", tmp_path / "broken.pt")
-    assert "broken.pt must be a map file" in message
+    assert "broken.pt must be a complete map file" in message
     assert "does not exist" in fails(capsys, "info", tmp_path / "none.pt")
     flat = tmp_path / "flat.npy"
     np.save(flat, np.zeros((4, 2)))

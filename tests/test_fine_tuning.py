@@ -152,7 +152,7 @@ def test_a_state_of_another_map_or_config_is_refused():
     model, points, labels = fitted()
     states, config = [], TuneConfig(epochs=1)
     fine_tune(model, points, labels, config=config, after_epoch=states.append)
-    with pytest.raises(ValueError, match="state must be of this config"):
+    with pytest.raises(ValueError, match="state must belong to this config"):
         fine_tune(model, points, labels, state=states[0])
     other = LardHilbertMap(2).fit(points, labels, num_clusters=10)
     with pytest.raises(ValueError, match="state must be of a map with 10 clusters; got 24"):

@@ -207,7 +207,7 @@ def test_unnamed_columns_past_the_third_are_a_guess(tmp_path):
     np.savetxt(tmp_path / "a.txt", np.hstack([world_points(), np.ones((240, 1))]))
     report = ScanReport()
     load_scans(tmp_path / "a.txt", origin=POSITION, report=report)
-    assert "first three columns taken for x y z (guess: name the columns" in str(report)
+    assert "first three columns assumed to be x y z (guess: name the columns" in str(report)
     with pytest.raises(ValueError, match="strict"):
         load_scans(tmp_path / "a.txt", origin=POSITION, strict=True)
 
@@ -220,10 +220,10 @@ def test_a_count_line_before_the_points_is_no_point(tmp_path, name, columns, hea
     (tmp_path / name).write_text(f"{head}240\n{rows}")
     np.testing.assert_array_equal(load_scans(tmp_path / name, origin=POSITION).ends, world_points())
     (tmp_path / name).write_text(f"{head}241\n{rows}")
-    with pytest.raises(ValueError, match=rf"{name}.*241 points are promised; got 240"):
+    with pytest.raises(ValueError, match=rf"{name}.*241 points are declared; got 240"):
         load_points(tmp_path / name)
     (tmp_path / name).write_text(f"{head}239\n{rows}")
-    with pytest.raises(ValueError, match=rf"{name}.*239 points are promised; more lines follow"):
+    with pytest.raises(ValueError, match=rf"{name}.*239 points are declared; more lines follow"):
         load_points(tmp_path / name)
 
 
@@ -267,7 +267,7 @@ def test_scans_of_a_ptx_without_any_position_are_placeholders(tmp_path):
     assert load_scans(tmp_path / "a.ptx").origins.tolist() == [[0, 0, 0]]
     (tmp_path / "a.ptx").write_text(one + one)
     with pytest.raises(
-        ValueError, match=r"a\.ptx must say where the sensor stood.*2 scans have it"
+        ValueError, match=r"a\.ptx must contain the sensor position.*2 scans have it"
     ):
         load_scans(tmp_path / "a.ptx")
 
@@ -281,11 +281,11 @@ def test_a_ptx_whose_position_and_matrix_disagree_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: text[:-200], r"points are promised; got|number of columns|invalid column"),
+        (lambda text: text[:-200], r"points are declared; got|number of columns|invalid column"),
         (lambda text: text.replace("12\n", "-12\n", 1), "must be a count"),
         (
             lambda text: text.replace("12\n", "99999999999\n", 1),
-            "points are promised; .* are too few",
+            "points are declared; .* are too few",
         ),
         (lambda text: "12\n20\n1 2\n" + text, "a 4 x 4 matrix"),
         (lambda text: text.replace("1.5", "east", 1), "a header must hold numbers"),

@@ -1,9 +1,11 @@
-"""Arguments of the command line that say how many clusters a fitted map gets."""
+"""Arguments of the command line that become settings of `LardHilbertMap.fit`."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
+from dataclasses import replace
 from typing import Any
 
 UNITS = {"": 1, "B": 1, "kB": 1000, "MB": 1000**2, "KiB": 1024, "MiB": 1024**2}
@@ -21,14 +23,41 @@ def add_map_size(sub: argparse.ArgumentParser) -> None:
         "--size",
         type=size_in_bytes,
         metavar="SIZE",
-        help="as many clusters as fit into a file of this size when the map is packed, such as 20kB",
+        help="choose as many clusters as fit into a packed map of this size, such as 20kB",
     )
     sub.add_argument(
         "--small",
         action="store_true",
-        help="about a third of the clusters, as many as the scene needs, with trained shapes: as good "
-        "at points, less exact in ranges and meshes",
+        help="choose only as many clusters as the scene needs, about a third of the default, and train "
+        "their shapes: probabilities are as accurate, ranges and meshes are less exact",
     )
+
+
+def add_hit_noise(sub: argparse.ArgumentParser) -> None:
+    """Add ``--hit-noise``."""
+    sub.add_argument(
+        "--hit-noise",
+        type=length_or_auto,
+        default=0.0,
+        metavar="METERS",
+        help="make surfaces thicker by this standard deviation, for queries at the poses of other scans "
+        "than SCANS; auto: what SCANS disagree by, estimated where they overlap (default: 0)",
+    )
+
+
+def length_or_auto(text: str) -> float | None:
+    """Meters, or None for ``auto``."""
+    if text == "auto":
+        return None
+    try:
+        length = float(text)
+    except ValueError:
+        length = math.nan
+    if not 0 <= length < math.inf:
+        raise argparse.ArgumentTypeError(
+            f"a length must be 0 or more meters, or auto; got {text!r}"
+        )
+    return length
 
 
 def size_in_bytes(text: str) -> int:
@@ -41,28 +70,35 @@ def size_in_bytes(text: str) -> int:
     return int(float(found[1]) * UNITS[found[2]])
 
 
-def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def fit_settings(arguments: argparse.Namespace, hit_noise: float) -> dict[str, Any]:
     """Keyword arguments of `LardHilbertMap.fit`.
+
+    Args:
+        arguments: of the command line.
+        hit_noise: standard deviation of the hits [m].
 
     Raises:
         ValueError: arguments exclude each other.
     """
+    from lardhm_torch.learning.fitting import FitConfig
     from lardhm_torch.learning.sized_maps import SMALL
 
     is_tuned = bool(arguments.tune or arguments.tune_state)
     if is_tuned and (arguments.size is not None or arguments.small):
-        raise ValueError(
-            "--size and --small cannot be used with --tune, which trains shapes itself"
-        )
+        raise ValueError("--size and --small cannot be used with --tune, which also trains shapes")
     if arguments.small and arguments.clusters is not None:
         raise ValueError("--small cannot be used with --clusters; it chooses the number")
-    settings: dict[str, Any] = {"num_clusters": arguments.clusters, "max_bytes": arguments.size}
-    if arguments.small:
-        settings["config"] = SMALL
-    return settings
+    config = SMALL if arguments.small or arguments.size is not None else FitConfig()
+    return {
+        "num_clusters": arguments.clusters,
+        "max_bytes": arguments.size,
+        "config": replace(config, hit_noise=hit_noise),
+    }
 
 
 def check_not_incremental(arguments: argparse.Namespace) -> None:
-    """Raise a ValueError if an argument is given that a fit of single scans does not have."""
+    """Raise a ValueError for arguments that an incremental fit does not support."""
     if arguments.size is not None or arguments.small:
         raise ValueError("--size and --small cannot be used with --incremental")
+    if arguments.hit_noise != 0:
+        raise ValueError("--hit-noise needs all scans at once; omit --incremental")

@@ -13,7 +13,7 @@ from lardhm_torch.cli.scan_files import far_hits, iter_pieces_of, sampling_of
 
 
 def tile(arguments: argparse.Namespace) -> None:
-    """Distribute the training points of scans, which may exceed memory, to tiles."""
+    """Sample scans, which may be too large for memory, and write the training points of each tile."""
     from lardhm_torch.tiles.routing import TilingConfig, tile_scans
 
     config = TilingConfig(
@@ -33,7 +33,7 @@ def tile(arguments: argparse.Namespace) -> None:
 
 
 def fit_tiles(arguments: argparse.Namespace) -> None:
-    """Fit the tiles of a folder; resumes after an interruption and runs under torchrun."""
+    """Fit the tiles of a folder. Resumes after an interruption and can be run by torchrun."""
     from lardhm_torch.tiles import fitting
 
     manifest = fitting.fit_tiles(arguments.folder, progress=True)

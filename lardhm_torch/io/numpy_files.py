@@ -200,7 +200,7 @@ def _checked_entry(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     entry = archive.getinfo(f"{name}.npy")
     held = min(entry.compress_size, os.path.getsize(str(archive.filename)) - entry.header_offset)
     if entry.compress_size > held or entry.file_size > _DEFLATE_RATIO * held + 1024:
-        raise ValueError(f"{name} promises {entry.file_size} bytes; {held} cannot hold them")
+        raise ValueError(f"{name} declares {entry.file_size} bytes; {held} cannot hold them")
     return entry
 
 

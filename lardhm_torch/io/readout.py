@@ -1,4 +1,4 @@
-"""What a reader found in a file, before it is known whether it is complete."""
+"""The contents of a scan file, before they are known to be complete."""
 
 from __future__ import annotations
 

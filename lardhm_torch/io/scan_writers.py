@@ -115,7 +115,8 @@ WRITERS: dict[str, Callable[[Path, Columns], None]] = {".ply": write_ply, ".pcd"
 def save_scans(scans: Scans, path: str | os.PathLike[str]) -> None:
     """Write scans with their channels as ``.npz``, or as the points of ``.ply`` or ``.pcd``, atomically.
 
-    `load_scans` reads all three back. Scans without rays have no point, and are lost in .ply and .pcd.
+    `load_scans` reads all three formats. Scans without rays are lost in .ply and .pcd, because they
+    have no points.
 
     Args:
         scans: range scans, world frame.

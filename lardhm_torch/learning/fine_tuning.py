@@ -1,4 +1,4 @@
-"""Joint optimization of length-scales, centers and weights by backpropagation."""
+"""Joint optimization of length scales, centers and weights by backpropagation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ from lardhm_torch.learning.fitting import (
     stratified_batches,
 )
 from lardhm_torch.learning.parameters import MapParameters, read_state
-from lardhm_torch.learning.points import check_samples, in_morton_order, to_map_frame
+from lardhm_torch.learning.points import (
+    blurred_hits,
+    check_noise,
+    check_samples,
+    in_morton_order,
+    to_map_frame,
+)
 from lardhm_torch.learning.tuning_steps import (
     Batches,
     Moving,
@@ -53,22 +59,22 @@ def fine_tune(
     progress: bool = False,
     config: TuneConfig | None = None,
 ) -> list[float]:
-    """Optimize centers, length-scales and weights of a fitted map on the balanced log-loss.
+    """Optimize centers, length scales and weights of a fitted map on the balanced log-loss.
 
     The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
-    of centers are in units of the mean length-scale of their cluster, and the diagonals of factors
+    of centers are in units of the mean length scale of their cluster, and the diagonals of factors
     are optimized as logarithms. Learning rates are therefore independent of the scene, and every
-    factor remains valid. In each epoch the neighbors are searched once and the points passed several
-    times, in groups, so that memory for neighbors does not grow with the number of points. With
-    ``hold_out``, a fraction of the rays is excluded from training, and the parameters of the epoch
-    with the smallest loss on them are kept. The initial map is not a candidate, because `fit` has
-    used those rays. If anything fails, the map is unchanged.
+    factor remains valid. In each epoch the neighbors are searched once, and several passes over the
+    points are made in groups, so that the memory for neighbors does not grow with the number of
+    points. With ``hold_out``, a fraction of the rays is excluded from training, and the parameters of
+    the epoch with the smallest loss on them are kept. The initial map is not a candidate, because
+    `fit` has used those rays. If anything fails, the map is unchanged.
 
     Args:
         model: a fitted map, changed in place.
         points: (N, D) world positions [m].
         labels: (N,) 1 occupied, 0 free, 1/2 unknown. If there are unknown points, more are drawn in the
-            tails of the kernels in every epoch, as in `fit`: kernels do not grow into unseen space.
+            tails of the kernels in every epoch, as in `fit`, so kernels do not extend into unknown space.
         ray_id: (N,) ray of each point, so that complete rays are held out (`Samples.ray_id`);
             None: points are held out individually.
         resample: function that returns new samples of the same rays, given the number of the epoch
@@ -96,6 +102,8 @@ def fine_tune(
     rng = seeded_generator(seed, "fine_tune", model.origin.device)
     held_rays = _hold_out(samples, config.hold_out, rng)
     train, evaluation = _divide(samples, held_rays)
+    seen = blurred_hits(evaluation.positions, evaluation.labels, config.hit_noise, rng)
+    evaluation = evaluation._replace(positions=seen)
     run = TuningRun(model, config, rng, evaluation)
     run.load(state) if state else run.losses.append(run.evaluate())
     for epoch in run.epochs(progress):
@@ -119,9 +127,7 @@ def _check_task(model: MapParameters, config: TuneConfig, rays_are_unknown: bool
     if not (config.tune_weights or config.tune_centers or config.tune_scales):
         raise ValueError("config must leave weights, centers or scales to tune; it freezes all")
     if config.hold_out and rays_are_unknown:
-        raise ValueError(
-            "ray_id must be given where held-out rays are to be sampled anew; got none"
-        )
+        raise ValueError("ray_id must be given if held-out rays are sampled again; got none")
 
 
 def _check(
@@ -184,16 +190,17 @@ class TuneConfig:
     ``l2`` and ``stiffness`` are relative to the summed loss of all points.
     """
 
-    epochs: int = 4  # with new neighbors, and new samples where they are drawn anew
-    passes: int = 3  # over the samples of an epoch
+    epochs: int = 4  # number of epochs; neighbors, and samples with ``resample``, are new in each
+    passes: int = 3  # passes over the samples in each epoch
     batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
-    center_rate: float = 0.02  # per step, relative to the mean length-scale of the cluster
-    scale_rate: float = 0.02  # per step, of the logarithm of the length-scales
+    center_rate: float = 0.02  # learning rate of centers, relative to the mean length scale
+    scale_rate: float = 0.02  # learning rate of the logarithm of the length scales
     l2: float = 0.25  # penalty on squared weights
-    stiffness: float = 0.8  # penalty on squared offsets of centers and length-scales
+    stiffness: float = 0.8  # penalty on squared offsets of centers and length scales
     occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`
-    unknown_share: float = 0.1  # loss of unknown points, relative to all others; 0: not trained on
+    hit_noise: float = 0.0  # [m] random displacement of hits in training, see `FitConfig`
+    unknown_share: float = 0.1  # relative loss of unknown points, see `FitConfig`; 0: omit them
     hold_out: float = 0.0  # fraction of rays used to select the best epoch; 0: keep the last
     patience: int | None = None  # stop after this many epochs without improvement
     tune_weights: bool = True
@@ -212,6 +219,7 @@ class TuneConfig:
             raise ValueError(
                 f"l2 and stiffness must be 0 or more; got {self.l2} and {self.stiffness}"
             )
+        check_noise(self.hit_noise)
         if not 0 < self.occupied_share < 1:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
         if not self.unknown_share >= 0:
@@ -235,7 +243,7 @@ def tuned_table(start: Tensor, config: TuneConfig, kernel: Kernel) -> Table:
     size = raw.diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
     size = kernel.covariance_scale**0.5 * size.clamp(min=kernel.min_lengthscale)
     eye = torch.eye(dim, dtype=torch.bool, device=size.device)
-    unit = to_rows(  # size: (M, 1) mean length-scale of the kernels [m]
+    unit = to_rows(  # size: (M, 1) mean length scale of the kernels [m]
         torch.ones_like(size[:, 0]),
         size.expand(-1, dim),
         torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),
@@ -307,6 +315,7 @@ class TuningRun:
         for group, steps_per_pass in enumerate(steps):
             columns = (positions, targets, factors)
             points, labels, weights = (column[group::groups].contiguous() for column in columns)
+            points = blurred_hits(points, labels, config.hit_noise, self.rng)
             near = self._neighbors(points)
             *batches, near = stratified_batches(
                 (points, labels, weights, near), batch_size, self.rng
@@ -368,7 +377,7 @@ class TuningRun:
     def load(self, state: State) -> None:
         """Resume from a state."""
         if state["config"] != asdict(self.config):
-            raise ValueError(f"state must be of this config; got one of {state['config']}")
+            raise ValueError(f"state must belong to this config; got {state['config']}")
         start = self.table.start
         if state["start"].shape != start.shape:
             raise ValueError(

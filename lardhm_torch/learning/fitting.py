@@ -16,6 +16,7 @@ from lardhm_torch.learning.bridging import bridged
 from lardhm_torch.learning.clustering import cluster_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
+from lardhm_torch.learning.points import blurred_hits, check_noise
 from lardhm_torch.learning.unseen import settle_unknown
 
 CHUNK_ROWS = 1 << 21  # number of points whose features are computed at a time
@@ -29,12 +30,12 @@ FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 class FitConfig:
     """Training settings of the weights.
 
-    The defaults train to convergence. The setting of the paper, one pass at a constant rate without
-    preconditioner, is ``FitConfig(passes=1, learning_rate=0.1, decay=False, preconditioner=False,
-    batch_size=1)``; its log-loss is higher (see docs and benchmarks).
+    The defaults train to convergence. The settings of the paper, one pass at a constant learning rate
+    without preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False,
+    preconditioner=False, batch_size=1)``; the log-loss is then higher (see docs and benchmarks).
     """
 
-    passes: int | None = None  # over all points; None: 4, or more to reach `MIN_STEPS` steps
+    passes: int | None = None  # passes over all points; None: 4, or more to reach `MIN_STEPS` steps
     batch_size: int | None = None  # points per step; None: N / 128, at least 256
     learning_rate: float = 0.5  # eta in eq. (4)
     decay: bool = True  # eta falls linearly to 0; otherwise constant
@@ -45,12 +46,14 @@ class FitConfig:
     # Class weight of occupied points, as a fraction of the loss, if classes are balanced. It exceeds
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
-    unknown_share: float = 0.25  # loss of unknown points, relative to all others
-    # Surfaces go on across gaps that no ray passed through, as between the rings of a lidar (`bridging`)
-    bridge_gaps: bool = True
-    # 0: the number of clusters is chosen from the points, and the weights are trained. 4: the scene
-    # decides on the number (`scene_clusters`), and so many passes train centers and length-scales, too.
-    # A third of the clusters then answers points as well, but ranges and meshes are less exact.
+    unknown_share: float = 0.25  # weight of the loss of unknown points, relative to all others
+    bridge_gaps: bool = True  # extend surfaces across gaps that no ray crossed (`bridging`)
+    # [m] standard deviation of random displacements of hits while the weights are trained. Surfaces are
+    # then as thick as scans disagree (`scan_disagreement`), for queries at the poses of other scans.
+    hit_noise: float = 0.0
+    # passes that also train centers and length scales of a small map: the number of clusters is chosen
+    # by the held-out loss of a coarse map (`scene_clusters`), about a third of the default.
+    # Probabilities are as accurate, but ranges and meshes are less exact. 4 is recommended; 0: off.
     shape_passes: int = 0
 
     def rows_per_batch(self, num_points: int) -> int:
@@ -76,6 +79,7 @@ class FitConfig:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
         if not self.unknown_share >= 0:
             raise ValueError(f"unknown_share must be 0 or more; got {self.unknown_share}")
+        check_noise(self.hit_noise)
         if self.l1 < 0 or self.l2 < 0:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
@@ -121,9 +125,10 @@ def fit_clusters(
     state = replace(state, evidence=fitted_evidence(points, labels, state, task.rng))
     if task.config.bridge_gaps:
         state, points, labels = bridged(state, points, labels, task.kernel, task.rng)
-    columns = settle_unknown(points, labels, state, task.kernel, task.rng)
-    batch_size = task.config.rows_per_batch(len(columns[0]))
-    points, labels = stratified_batches(columns, batch_size, task.rng)
+    points, labels = settle_unknown(points, labels, state, task.kernel, task.rng)
+    points = blurred_hits(points, labels, task.config.hit_noise, task.rng)
+    batch_size = task.config.rows_per_batch(len(points))
+    points, labels = stratified_batches((points, labels), batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def compute(rows: slice) -> tuple[Tensor, Tensor]:

@@ -169,10 +169,10 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
 
     Clusters that match by Algorithm 2 are merged, with weights and centers averaged in proportion to
     their numbers of points; all other clusters are copied. Where the probability of the merged map
-    deviates from that of the given maps, its weights are trained on the evidence of both
+    deviates from that of the given maps, its weights are trained on the kept points of both
     maps. Maps that do not overlap are combined unchanged, and merging a map with itself does not
     change its probabilities. The posterior of the weights is discarded, because the two maps were
-    calibrated apart (see `LardHilbertMap.fit_uncertainty`).
+    calibrated separately (see `LardHilbertMap.fit_uncertainty`).
 
     Args:
         first: a `LardHilbertMap`.

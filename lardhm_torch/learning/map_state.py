@@ -91,7 +91,7 @@ def _widened(part: MapState, like: MapState, name: str) -> Tensor:
 def new_rows(
     clusters: Clusters, is_occupied: Tensor, floor: float, evidence: Tensor | None = None
 ) -> MapState:
-    """Rows of new clusters, with centers and length-scales from their moments and weights of 0.
+    """Rows of new clusters, with centers and length scales from their moments and weights of 0.
 
     Args:
         clusters: M clusters.

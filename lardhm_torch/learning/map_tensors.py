@@ -62,10 +62,8 @@ class MapTensors(nn.Module):
         self.num_neighbors = num_neighbors
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
-        self.max_age: float | None = (
-            None  # [s] clusters not seen for longer are removed by `update`
-        )
-        self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
+        self.max_age: float | None = None  # [s], see `LardHilbertMap`
+        self.is_packed = False  # a packed map is rounded, for queries only
         with normal_tensors():
             self._register_empty(dim, device, dtype)
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
@@ -123,12 +121,12 @@ class MapTensors(nn.Module):
 
     @property
     def scale_tril(self) -> Tensor:
-        """(M, D, D) lower Cholesky factors of the kernels [m], settings of the kernel applied."""
+        """(M, D, D) lower Cholesky factors of the kernels [m], scaled and bounded by the settings."""
         return kernel_factors(at_least_float32(self.raw_scale_tril), self.kernel)
 
     @property
     def kernel(self) -> Kernel:
-        """Number of neighbors, covariance scale and minimum length-scale of the kernels."""
+        """Number of neighbors, covariance scale and minimum length scale of the kernels."""
         return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
 
     @property

@@ -32,15 +32,15 @@ class MapParameters(MapTensors):
     """
 
     def reading(self) -> AbstractContextManager[None]:
-        """A context in which all queries see the same map: other threads wait before they change it.
+        """A context in which all queries see the same map. Threads that change the map wait.
 
-        Every single query sees one map anyway, while another thread runs `fit`, `update`, `fine_tune`
-        or any other function of this package that changes the map.
+        A single query needs no context: it always sees the map before or after a change by `fit`,
+        `update`, `fine_tune` or another function of this package in another thread.
         """
         return self.lock.reading()
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """See `torch.nn.Module.load_state_dict`; the map adopts the number of clusters."""
+        """See `torch.nn.Module.load_state_dict`; the map gets as many clusters as the state dict has."""
         with self.lock.changing(), self.lock.writing():
             return super().load_state_dict(*args, **kwargs)
 
@@ -58,7 +58,7 @@ class MapParameters(MapTensors):
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
         """Parameter groups for an optimizer, with weight decay on the weights only.
 
-        Weight decay would pull centers to the map's origin and length-scales to 1 m.
+        Weight decay would pull centers to the map's origin and length scales to 1 m.
         """
         return [
             {"params": [self.weights], "weight_decay": weight_decay},
@@ -99,10 +99,10 @@ class MapParameters(MapTensors):
         self.max_age = state.get("max_age")
 
     def check_learns(self) -> None:
-        """Raise a ValueError if the map is packed: it has lost what learning continues from."""
+        """Raise a ValueError if the map is packed: it has no points and moments to train from."""
         if self.is_packed:
             raise ValueError(
-                "model must hold what it learned from; a packed map answers but does not learn. "
+                "model must not be packed; a packed map supports queries, but no training. "
                 "Load the file written by save, or make a new map"
             )
 

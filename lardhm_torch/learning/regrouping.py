@@ -1,9 +1,9 @@
-"""Regrouping: new points and the evidence of the clusters near them, grouped anew where they changed.
+"""Regrouping of new points and of the kept points of the clusters near them.
 
-One step of adaptive k-means on the kept points, for each class by itself. Clusters whose points the
-map predicts badly are divided, new points join the nearest cluster or form new ones, every point of a
-changed cluster goes to its nearest center, and clusters with too few points are dissolved into their
-neighbors.
+This is one step of adaptive k-means on the kept points, separately for each class. Clusters whose points
+have a large loss are divided, new points join the nearest cluster or form new clusters, all points of
+changed clusters are reassigned to their nearest centers, and clusters with too few points are dissolved
+into their neighbors.
 """
 
 from __future__ import annotations

@@ -71,6 +71,12 @@ def channel_shapes(
     return layout, {name: shapes[name] for name in present}
 
 
+def file_state(state: dict[str, Any], evidence: bool) -> dict[str, Any]:
+    """What a map file holds of a state dict; without ``evidence``, nothing that only updates need."""
+    kept = {name: value for name, value in state.items() if evidence or name not in HISTORY}
+    return occupied_sums(kept)
+
+
 def occupied_sums(state: dict[str, Any]) -> dict[str, Any]:
     """The state dict of a map with the channel sums of its occupied clusters alone: others have none."""
     if "channel_sums" not in state:
