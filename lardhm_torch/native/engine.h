@@ -151,7 +151,7 @@ struct Engine {
   // Where the run of sorted points i .. stop should end: not across a border of the Z curve's cells
   // whose cell holds many more points, for the curve jumps there and the run's box would be large.
   static int64_t cut(const std::vector<uint64_t>& items, int64_t n, int64_t i, int64_t stop) {
-    const int64_t around = 2 * (stop - i);
+    const int64_t around = 8 * (stop - i);
     const auto key = [&items](int64_t at) { return uint32_t(items[at] >> 32); };
     while (key(i) != key(stop - 1)) {
       const int bit = 31 - __builtin_clz(key(i) ^ key(stop - 1));
