@@ -13,6 +13,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 #include <utility>
 #include <vector>
 
@@ -24,6 +25,8 @@ namespace lardhm {
 
 constexpr int64_t kMostPoints = 1024;  // in a region
 constexpr double kNotZero = 1e-30;     // [m^2] farther than centers at the point itself
+template <class T>  // so that rounding leaves the k-th center nothing
+constexpr T kFully = 1 + 2 * std::numeric_limits<T>::epsilon();
 constexpr double kRegionPoints = 3000, kGroupPoints = 160, kSparse = 25;
 
 // How many sorted points share a list of blocks, a list of candidates, a register. The fewer points
@@ -305,7 +308,7 @@ struct Engine {
       if (farthest <= radius) {
         s.radius = farthest * 1.15f;
         packet.farthest = (V)limit;
-        packet.fading = fades ? T(1) / (packet.farthest + std::numeric_limits<T>::min()) : V{};
+        packet.fading = fades ? kFully<T> / (packet.farthest + std::numeric_limits<T>::min()) : V{};
         packet.all_fade = fades && !bits && std::isfinite(farthest) &&
                           smallest_lane<T>(packet.farthest) > kNotZero;
         if (packet.all_fade) return select_nearer(packet, n, s);

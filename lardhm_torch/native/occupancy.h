@@ -49,9 +49,9 @@ struct OccupancyVisitor final : Visitor<T, D> {
     for (int64_t j = 0; j < selected.size; ++j) {
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
       whiten<T, D>(packet, positions + int64_t(selected.rank[j]) * L::position, shape, z);
-      const V squared = packet.squared[j];
-      const V term = fade_within<T>(squared * packet.fading) * kernel_of<T, D>(z);
-      sum = squared < packet.farthest ? sum + term * shape[L::weight] : sum;
+      const V t = packet.squared[j] * packet.fading;
+      const V term = kernel_of<T, D>(z) * fade_within<T>(t);
+      sum = t < T(1) ? sum + term * shape[L::weight] : sum;
     }
     return sum;
   }
