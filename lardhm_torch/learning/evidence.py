@@ -22,22 +22,10 @@ from lardhm_torch.learning.clustering import (
     split_labels,
 )
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
+from lardhm_torch.native.thinning import BITS, priorities
 from lardhm_torch.sampling import spread_rows
 
 SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
-MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
-BITS = 31  # of a priority
-
-
-def priorities(points: Tensor) -> Tensor:
-    """(N, D) positions -> (N,) int64 hashes of the coordinates in float32, below 2^31."""
-    words = points.float().view(torch.int32).long() & 0xFFFFFFFF
-    mixed = torch.zeros_like(words[:, 0])
-    for axis in range(points.shape[1]):
-        mixed = (mixed ^ words[:, axis]) * MULTIPLIERS[axis % 3] & 0xFFFFFFFF
-        mixed = mixed ^ (mixed >> 15)
-    mixed = mixed * MULTIPLIERS[1] & 0xFFFFFFFF
-    return mixed >> (32 - BITS)
 
 
 def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:

@@ -2,30 +2,14 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <cstring>
 #include <limits>
 #include <vector>
 
 #include "clusters.h"
+#include "priority.h"
 
 namespace lardhm {
 namespace {
-
-constexpr uint32_t kMultipliers[3] = {0x9E3779B1u, 0x85EBCA77u, 0xC2B2AE3Du};
-
-// Hash of the coordinates in float32, below 2^31.
-template <class T, int D>
-uint32_t priority(const T* point) {
-  uint32_t mixed = 0;
-  for (int d = 0; d < D; ++d) {
-    const float value = float(point[d]);
-    uint32_t word;
-    std::memcpy(&word, &value, sizeof(word));
-    mixed = (mixed ^ word) * kMultipliers[d % 3];
-    mixed ^= mixed >> 15;
-  }
-  return (mixed * kMultipliers[1]) >> 1;
-}
 
 // Rows of the points of each cluster: those of cluster m are rows[first[m]] to rows[first[m + 1]].
 struct Groups {
@@ -45,15 +29,15 @@ struct Groups {
 
 template <class T, int D>
 struct Candidate {
-  uint32_t priority;
+  uint32_t rank;
   T point[D];
 
   bool operator<(const Candidate& other) const {
-    if (priority != other.priority) return priority < other.priority;
+    if (rank != other.rank) return rank < other.rank;
     return std::lexicographical_compare(point, point + D, other.point, other.point + D);
   }
   bool operator==(const Candidate& other) const {
-    return priority == other.priority && std::equal(point, point + D, other.point);
+    return rank == other.rank && std::equal(point, point + D, other.point);
   }
 };
 
@@ -72,7 +56,7 @@ void keep(const T* points, const int32_t* rows, int64_t n, int64_t size,
   found.resize(n);
   for (int64_t i = 0; i < n; ++i) {
     const T* point = points + int64_t(rows[i]) * D;
-    found[i].priority = priority<T, D>(point);
+    found[i].rank = priority<T, D>(point);
     std::copy_n(point, D, found[i].point);
   }
   if (n > 4 * size) {  // repeated points are rare: the smallest 2 size hold enough distinct ones

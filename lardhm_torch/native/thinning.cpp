@@ -1,0 +1,93 @@
+// One point of each cell of a lattice, see `thinning.one_per_cell`.
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "priority.h"
+#include "tensors.h"
+
+namespace lardhm {
+namespace {
+
+// Hash of a point's cell and group. Two cells of 10^6 agree in it once in 10^7 sets.
+template <class T, int D>
+uint64_t cell_of(const T* point, int64_t group, T edge) {
+  uint64_t mixed = 0;
+  const auto mix = [&mixed](int64_t word) {
+    mixed = (mixed ^ uint64_t(word)) * 0x9E3779B97F4A7C15ull;
+    mixed ^= mixed >> 32;
+  };
+  for (int d = 0; d < D; ++d) mix(int64_t(std::floor(point[d] / edge)));
+  mix(group);
+  return mixed;
+}
+
+// The row that each cell has chosen: a table with linear probing.
+class Chosen {
+  struct Entry {
+    uint64_t cell;
+    uint32_t rank;
+    int32_t row;
+  };
+  std::vector<Entry> table;
+  uint64_t last;
+
+ public:
+  explicit Chosen(int64_t most) {
+    uint64_t room = 16;
+    while (room < 2 * uint64_t(most)) room *= 2;
+    table.assign(room, Entry{0, 0, -1});
+    last = room - 1;
+  }
+
+  void offer(uint64_t cell, uint32_t rank, int32_t row) {
+    uint64_t at = cell & last;
+    while (table[at].row >= 0 && table[at].cell != cell) at = (at + 1) & last;
+    if (table[at].row < 0 || rank < table[at].rank) table[at] = {cell, rank, row};
+  }
+
+  std::vector<int32_t> rows() const {
+    std::vector<int32_t> found;
+    for (const Entry& entry : table)
+      if (entry.row >= 0) found.push_back(entry.row);
+    std::sort(found.begin(), found.end());
+    return found;
+  }
+};
+
+Tensor one_per_cell(const Tensor& given_points, const Tensor& given_groups, double edge) {
+  const Tensor points = tidy(given_points), groups = tidy(given_groups);
+  check(edge > 0, "edge must be > 0");
+  check(points.dim() == 2 && groups.scalar_type() == ScalarType::Long &&
+            groups.numel() == points.size(0),
+        "groups must be (N,) int64, one per point");
+  std::vector<int32_t> rows;
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const int64_t n = points.size(0);
+    Chosen chosen(n);
+    for (int64_t i = 0; i < n; ++i) {
+      const T* point = in<T>(points) + i * D;
+      chosen.offer(cell_of<T, D>(point, in<int64_t>(groups)[i], T(edge)),
+                   priority<T, D>(point, kCellPriorities), int32_t(i));
+    }
+    rows = chosen.rows();
+    return 0;
+  });
+  const Tensor result = new_empty(points, {int64_t(rows.size())}, ScalarType::Long);
+  std::copy(rows.begin(), rows.end(), out<int64_t>(result));
+  return result;
+}
+
+}  // namespace
+
+std::vector<Operator> thinning_operators() {
+  return {
+      {"one_per_cell(Tensor points, Tensor groups, float edge) -> Tensor", &boxed<one_per_cell>},
+  };
+}
+
+}  // namespace lardhm

@@ -1,0 +1,48 @@
+"""Random choices that depend on the points alone: priorities, and one point of each cell.
+
+The same points give the same choice, in whatever order and at whatever time they come.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lardhm_torch import native
+
+MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
+BITS = 31  # of a priority
+CELLS = 0x27D4EB2F  # start of the hash that chooses a point of a cell: independent of the others
+
+
+def priorities(points: Tensor, start: int = 0) -> Tensor:
+    """(N, D) positions -> (N,) int64 hashes of the coordinates in float32, below 2^31.
+
+    Different ``start`` values below 2^32 give different hashes.
+    """
+    words = points.float().view(torch.int32).long() & 0xFFFFFFFF
+    mixed = torch.full_like(words[:, 0], start)
+    for axis in range(points.shape[1]):
+        mixed = (mixed ^ words[:, axis]) * MULTIPLIERS[axis % 3] & 0xFFFFFFFF
+        mixed = mixed ^ (mixed >> 15)
+    mixed = mixed * MULTIPLIERS[1] & 0xFFFFFFFF
+    return mixed >> (32 - BITS)
+
+
+def one_per_cell(points: Tensor, groups: Tensor, edge: float) -> Tensor:
+    """Ascending rows of one random point of each group in each cell of a lattice.
+
+    Args:
+        points: (N, D) positions [m].
+        groups: (N,) int64; points of different groups may share a cell.
+        edge: of the cells [m].
+    """
+    if native.supports(points):
+        return torch.ops.lardhm.one_per_cell(points.detach(), groups, edge)
+    order = priorities(points, CELLS).argsort(stable=True)
+    cells = (points / edge).floor().long()
+    _, owners = torch.cat([cells, groups[:, None]], dim=1)[order].unique(dim=0, return_inverse=True)
+    place = torch.arange(len(order), device=order.device)
+    first = torch.full_like(place, len(order))
+    first.scatter_reduce_(0, owners, place, "amin")
+    return order[first[first < len(order)]].sort().values
