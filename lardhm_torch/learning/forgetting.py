@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import feature_sums
-from lardhm_torch.learning.evidence import first_points, kept_counts
+from lardhm_torch.learning.evidence import kept_counts
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.sampling import UNKNOWN
 
@@ -69,9 +69,12 @@ def forget(known: MapState, before: Tensor) -> MapState:
     kept = kept_counts(known.evidence)
     lost = (known.doubts > GONE) | ((known.kinds == 2) & (known.losses > OVERRULED))
     changed = trust(known.doubts) != trust(before)
+    evidence = known.evidence
+    if bool(lost.any()):
+        evidence = evidence.index_fill(0, lost.nonzero().squeeze(1), torch.inf)
     return replace(
         known,
-        evidence=first_points(known.evidence, torch.where(lost, 0, kept)),
+        evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
         fresh=torch.where(changed | lost, kept.to(known.fresh), known.fresh),
     )

@@ -336,6 +336,12 @@ def _register() -> None:
     def _(points: Tensor, groups: Tensor, edge: float) -> Tensor:
         return groups.new_empty(library.get_ctx().new_dynamic_size())
 
+    @library.register_fake("lardhm::add_points")
+    def _(evidence: Tensor, cleared: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+        count = cleared.shape[0]
+        new = cleared.new_empty(count, dtype=torch.long)
+        return evidence.new_empty(count, *evidence.shape[1:]), new
+
     @library.register_fake("lardhm::descent")
     def _(indices: Tensor, values: Tensor, labels: Tensor, factors: Tensor, weights: Tensor,
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip

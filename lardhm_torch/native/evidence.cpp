@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <iterator>
 #include <limits>
 #include <vector>
 
@@ -95,12 +96,106 @@ Tensor keep_points(const Tensor& given_points, const Tensor& given_owners, int64
   return kept;
 }
 
+// Candidates for one cluster's evidence: those it keeps, in ascending order, and new ones.
+template <class T, int D>
+struct Merger {
+  int64_t size;
+  std::vector<Candidate<T, D>> before, kept, added, merged;
+
+  void read(const T* points) {
+    before.clear();
+    for (int64_t i = 0; i < size && points[i * D] != std::numeric_limits<T>::infinity(); ++i)
+      before.push_back(candidate(points + i * D));
+    if (!std::is_sorted(before.begin(), before.end()))  // points that were moved with their map
+      std::sort(before.begin(), before.end());
+  }
+
+  static Candidate<T, D> candidate(const T* point) {
+    Candidate<T, D> found;
+    found.rank = priority<T, D>(point);
+    std::copy_n(point, D, found.point);
+    return found;
+  }
+
+  // Number of candidates of the ascending `merged` that are kept and were not before.
+  int64_t count_new() const {
+    int64_t count = 0;
+    auto old = before.begin();
+    for (const auto& one : merged) {
+      while (old != before.end() && *old < one) ++old;
+      count += old == before.end() || !(*old == one);
+    }
+    return count;
+  }
+
+  // Writes the evidence after the rows were added, and returns the number of its new points.
+  int64_t merge(const T* points, const int32_t* rows, int64_t n, bool cleared, T* to) {
+    kept.clear(), added.clear(), merged.clear();
+    if (!cleared) kept = before;
+    const bool full = int64_t(kept.size()) == size;
+    for (int64_t i = 0; i < n; ++i) {
+      const auto one = candidate(points + int64_t(rows[i]) * D);
+      if (!full || one < kept.back()) added.push_back(one);
+    }
+    std::sort(added.begin(), added.end());
+    std::merge(kept.begin(), kept.end(), added.begin(), added.end(), std::back_inserter(merged));
+    merged.erase(std::unique(merged.begin(), merged.end()), merged.end());
+    if (int64_t(merged.size()) > size) merged.resize(size);
+    write(merged, size, to);
+    return count_new();
+  }
+};
+
+Tensors<2> add_points(const Tensor& given_evidence, const Tensor& given_cleared,
+                      const Tensor& given_points, const Tensor& given_owners) {
+  const Tensor evidence = tidy(given_evidence), cleared = tidy(given_cleared);
+  const Tensor points = tidy(given_points), owners = tidy(given_owners);
+  const int64_t known = evidence.size(0), size = evidence.size(1), dim = evidence.size(2);
+  const int64_t count = cleared.numel(), n = points.size(0);
+  check(points.dim() == 2 && points.size(1) == dim && owners.numel() == n &&
+            points.scalar_type() == evidence.scalar_type() &&
+            owners.scalar_type() == ScalarType::Int,
+        "points must be (N, D) like the evidence, owners (N,) int32");
+  check(cleared.scalar_type() == ScalarType::Bool && count >= known,
+        "cleared must be bool, one per cluster");
+  const Tensors<2> result{new_empty(evidence, {count, size, dim}),
+                          new_empty(evidence, {count}, ScalarType::Long)};
+  dispatch(points, [&](auto type, auto dimension) {
+    using T = decltype(type);
+    constexpr int D = dimension();
+    const Groups groups(in<int32_t>(owners), n, count);
+    constexpr int64_t kGrain = 64;
+    run_tasks((count + kGrain - 1) / kGrain, [&](int64_t task) {
+      Merger<T, D> merger{size, {}, {}, {}, {}};
+      for (int64_t m = task * kGrain; m < std::min(count, (task + 1) * kGrain); ++m) {
+        const int64_t added = groups.first[m + 1] - groups.first[m];
+        T* to = out<T>(result[0]) + m * size * D;
+        out<int64_t>(result[1])[m] = 0;
+        if (m < known && !added && !in<bool>(cleared)[m]) {
+          std::copy_n(in<T>(evidence) + m * size * D, size * D, to);
+          continue;
+        }
+        merger.before.clear();
+        if (m < known) merger.read(in<T>(evidence) + m * size * D);
+        out<int64_t>(result[1])[m] =
+            merger.merge(in<T>(points), groups.rows.data() + groups.first[m], added,
+                         in<bool>(cleared)[m], to);
+      }
+    });
+    return 0;
+  });
+  return result;
+}
+
 }  // namespace
 
 std::vector<Operator> evidence_operators() {
   return {
       {"keep_points(Tensor points, Tensor owners, int num_clusters, int size) -> Tensor",
        &boxed<keep_points>},
+      {"add_points(Tensor evidence, Tensor cleared, Tensor points, Tensor owners) -> (Tensor, "
+       "Tensor)",
+       &boxed<add_points>},
   };
 }
 

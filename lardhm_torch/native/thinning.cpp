@@ -1,6 +1,5 @@
 // One point of each cell of a lattice, see `thinning.one_per_cell`.
 
-#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <vector>
@@ -35,9 +34,12 @@ class Chosen {
   uint64_t last;
 
  public:
-  explicit Chosen(int64_t most) {
+  std::vector<char> is_chosen;  // by row
+  int64_t count = 0;
+
+  explicit Chosen(int64_t size) : is_chosen(size, 0) {
     uint64_t room = 16;
-    while (room < 2 * uint64_t(most)) room *= 2;
+    while (room < 2 * uint64_t(size)) room *= 2;
     table.assign(room, Entry{0, 0, -1});
     last = room - 1;
   }
@@ -45,15 +47,13 @@ class Chosen {
   void offer(uint64_t cell, uint32_t rank, int32_t row) {
     uint64_t at = cell & last;
     while (table[at].row >= 0 && table[at].cell != cell) at = (at + 1) & last;
-    if (table[at].row < 0 || rank < table[at].rank) table[at] = {cell, rank, row};
-  }
-
-  std::vector<int32_t> rows() const {
-    std::vector<int32_t> found;
-    for (const Entry& entry : table)
-      if (entry.row >= 0) found.push_back(entry.row);
-    std::sort(found.begin(), found.end());
-    return found;
+    if (table[at].row >= 0 && table[at].rank <= rank) return;
+    if (table[at].row < 0)
+      ++count;
+    else
+      is_chosen[table[at].row] = 0;
+    is_chosen[row] = 1;
+    table[at] = {cell, rank, row};
   }
 };
 
@@ -63,23 +63,23 @@ Tensor one_per_cell(const Tensor& given_points, const Tensor& given_groups, doub
   check(points.dim() == 2 && groups.scalar_type() == ScalarType::Long &&
             groups.numel() == points.size(0),
         "groups must be (N,) int64, one per point");
-  std::vector<int32_t> rows;
+  const int64_t n = points.size(0);
+  Chosen chosen(n);
   dispatch(points, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
-    const int64_t n = points.size(0);
-    Chosen chosen(n);
     for (int64_t i = 0; i < n; ++i) {
       const T* point = in<T>(points) + i * D;
       chosen.offer(cell_of<T, D>(point, in<int64_t>(groups)[i], T(edge)),
                    priority<T, D>(point, kCellPriorities), int32_t(i));
     }
-    rows = chosen.rows();
     return 0;
   });
-  const Tensor result = new_empty(points, {int64_t(rows.size())}, ScalarType::Long);
-  std::copy(rows.begin(), rows.end(), out<int64_t>(result));
-  return result;
+  const Tensor rows = new_empty(points, {chosen.count}, ScalarType::Long);
+  int64_t* to = out<int64_t>(rows);
+  for (int64_t i = 0; i < n; ++i)
+    if (chosen.is_chosen[i]) *to++ = i;
+  return rows;
 }
 
 }  // namespace
