@@ -200,9 +200,15 @@ def follow_kept(
 
 
 def halves(evidence: Tensor) -> tuple[Tensor, Tensor]:
-    """Evidence of the two halves of each cluster, divided at the mean along its longest axis."""
+    """Evidence of the two halves of each cluster, divided at the mean along its longest axis.
+
+    The first half is where the largest component of the axis is positive.
+    """
+    if _is_native(evidence):
+        return torch.ops.lardhm.halves(evidence)
     clusters = evidence_moments(evidence)
     axes = torch.linalg.eigh(clusters.covariances).eigenvectors[:, :, -1]
+    axes = axes * axes.gather(1, axes.abs().argmax(dim=1, keepdim=True)).sign()
     along = ((evidence - clusters.means[:, None]) * axes[:, None]).sum(dim=2)
     parts = []
     for inside in (along > 0, along <= 0):  # padding is in neither

@@ -347,6 +347,14 @@ def _register() -> None:
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
         return tuple(torch.empty_like(weights) for _ in range(3))
 
+    @library.register_fake("lardhm::halves")
+    def _(evidence: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.empty_like(evidence), torch.empty_like(evidence)
+
+    @library.register_fake("lardhm::excess_losses")
+    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
+        return torch.empty_like(labels)
+
     @library.register_fake("lardhm::tuning_steps")
     def _(points: Tensor, indices: Tensor, labels: Tensor, factors: Tensor, start: Tensor,
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
