@@ -9,7 +9,6 @@ from torch import Tensor
 
 from lardhm_torch.channels import Channels, check_channels, pad_channels, select_channels
 from lardhm_torch.native.crossings import Lines, never_crossed, passages
-from lardhm_torch.native.thinning import one_per_cell
 from lardhm_torch.scans import Scans, seeded_generator
 
 UNKNOWN = 0.5  # label of points in unobserved space
@@ -187,10 +186,7 @@ def sample_rays(
         raise NoUsableRayError(
             f"scans must hold at least one usable ray of {len(scans)}; got {dropped}"
         )
-    rng = seeded_generator(seed, "sampling", scans.ends.device)
     rays = _rows(keep)
-    if max_points is not None and not scans.channels:
-        rays = _thinned_rays(scans, rays, config, max_points, rng)
     # the starts of a single scan are one point: gathering them for every ray would take longest
     starts = scans.origins[:1] if scans.num_scans == 1 else scans.ray_origins[rays]
     offsets = _taken(scans.ends, rays) - starts
@@ -200,12 +196,15 @@ def sample_rays(
     free_end = torch.where(is_hit, (reach - config.near_margin).clamp(min=0), reach)
     first = _taken(scans.target_index, rays) == 1
     ahead = offsets / ranges[:, None]
+    rng = seeded_generator(seed, "sampling", ranges.device)
     limits = _free_limits(int(first.sum()), int((is_hit & first).sum()), config, max_points)
     groups = [
         _stratified_depths(_rows(first), free_end, config.free_samples, limits[0], rng),
         _near_depths(_rows(is_hit & first), free_end, config, limits[1], rng),
     ]
     hits = _rows(is_hit)
+    if max_points is not None and max_points < len(hits) and not scans.channels:
+        hits = hits[spread_rows(len(hits), max_points, rng)]
     count = len(hits) + sum(depths.numel() for _, depths in groups)
     points, ray_id = ranges.new_empty(count, scans.dim), hits.new_empty(count)
     hit_rays = _taken(rays, hits)
@@ -238,20 +237,6 @@ def sample_rays(
     if config.behind_samples:
         samples = _with_unknown(samples, _taken(ahead, hits), lines, config, rng)
     return _with_channels(samples, channels)
-
-
-def _thinned_rays(
-    scans: Scans, rays: Tensor, config: SamplingConfig, limit: int, rng: torch.Generator
-) -> Tensor:
-    """Some of the ascending rows ``rays``: of each scan one that ends in each cell, and of those at most
-    ``limit`` with and ``limit`` without a hit.
-    """
-    is_hit = _taken(scans.is_return, rays)
-    groups = 2 * _taken(scans.scan_id, rays) + is_hit
-    chosen = one_per_cell(_taken(scans.ends, rays), groups, config.cell_edge)
-    parts = [chosen[is_hit[chosen]], chosen[~is_hit[chosen]]]
-    parts = [p[spread_rows(len(p), limit, rng)] if len(p) > limit else p for p in parts]
-    return rays[torch.cat(parts).sort().values]
 
 
 def _with_passing(

@@ -24,7 +24,7 @@ from lardhm_torch.learning.points import morton_order
 from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
-BLOCK = 128  # clusters that are chosen for training together
+BLOCK = 256  # clusters that are chosen for training together
 MIN_BATCHES = 8  # per pass, so that few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`

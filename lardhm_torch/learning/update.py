@@ -48,13 +48,13 @@ class UpdateConfig:
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
     split_loss: float = 0.01  # clusters whose points have a larger mean loss are divided
-    cell_edge: float = 0.1  # [m] one new point of each class is used in each cell
+    spacing: float = 0.05  # [m] of each class one new point is used in each cell of this edge
     max_points: int = 20_000  # new points of each class that are used; more are drawn at random
-    max_trained: int = 8_000  # changed clusters that are trained; the others follow later
+    max_trained: int = 5_000  # changed clusters that are trained; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
-        for name in ("zeta", "split_loss", "cell_edge", "max_points", "max_trained"):
+        for name in ("zeta", "split_loss", "spacing", "max_points", "max_trained"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0; got {getattr(self, name)}")
 
@@ -142,7 +142,7 @@ def _thinned(
 
     The samples of a scan are dense near the sensor. Evenly spread ones train the map better.
     """
-    chosen = one_per_cell(points, (2 * labels).long(), config.cell_edge)
+    chosen = one_per_cell(points, (2 * labels).long(), config.spacing)
     points, labels = points.index_select(0, chosen), labels.index_select(0, chosen)
     rows, limit = [], config.max_points
     for label in (1.0, 0.0, UNKNOWN):

@@ -1,5 +1,6 @@
 // One point of each cell of a lattice, see `thinning.one_per_cell`.
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <vector>
@@ -10,6 +11,12 @@
 namespace lardhm {
 namespace {
 
+constexpr double kFarthest = 1e15;  // as thinning.FARTHEST
+
+int64_t cell_number(double number) {
+  return number <= kFarthest ? int64_t(std::max(number, -kFarthest)) : int64_t(kFarthest);
+}
+
 // Hash of a point's cell and group. Two cells of 10^6 agree in it once in 10^7 sets.
 template <class T, int D>
 uint64_t cell_of(const T* point, int64_t group, T edge) {
@@ -18,7 +25,7 @@ uint64_t cell_of(const T* point, int64_t group, T edge) {
     mixed = (mixed ^ uint64_t(word)) * 0x9E3779B97F4A7C15ull;
     mixed ^= mixed >> 32;
   };
-  for (int d = 0; d < D; ++d) mix(int64_t(std::floor(point[d] / edge)));
+  for (int d = 0; d < D; ++d) mix(cell_number(double(std::floor(point[d] / edge))));
   mix(group);
   return mixed;
 }

@@ -12,6 +12,7 @@ from lardhm_torch import native
 
 MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
 BITS = 31  # of a priority
+FARTHEST = 1e15  # numbers of cells are limited to this; those of NaN, too
 CELLS = 0x27D4EB2F  # start of the hash that chooses a point of a cell: independent of the others
 
 
@@ -40,7 +41,7 @@ def one_per_cell(points: Tensor, groups: Tensor, edge: float) -> Tensor:
     if native.supports(points):
         return torch.ops.lardhm.one_per_cell(points.detach(), groups, edge)
     order = priorities(points, CELLS).argsort(stable=True)
-    cells = (points / edge).floor().long()
+    cells = (points / edge).floor().clamp(-FARTHEST, FARTHEST).nan_to_num(FARTHEST).long()
     _, owners = torch.cat([cells, groups[:, None]], dim=1)[order].unique(dim=0, return_inverse=True)
     place = torch.arange(len(order), device=order.device)
     first = torch.full_like(place, len(order))
