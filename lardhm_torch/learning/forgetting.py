@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import feature_sums
+from lardhm_torch.learning.clustering import split_labels
 from lardhm_torch.learning.evidence import kept_counts
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.sampling import UNKNOWN
@@ -40,14 +41,13 @@ def doubted(
         kernel: kernel settings of the map.
         index: search index of the centers, see `native.build_index`.
     """
-    seen = labels != UNKNOWN
-    points, is_hit = points[seen], labels[seen] > UNKNOWN
-    if len(known) == 0 or len(points) == 0:
+    if len(known) == 0 or not bool((labels != UNKNOWN).any()):
         return known.doubts
     kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, NARROWEST))
-    parameters = (known.centers, known.raw_scale_tril, kernel, index)
-    hits, passed = (feature_sums(points[rows], *parameters) for rows in (is_hit, ~is_hit))
-    doubts = torch.where(hits > HIT, 0, known.doubts + passed)
+    parameters = (known.centers, known.raw_scale_tril, known.is_occupied, kernel, index)
+    hits, free, _ = split_labels(points, labels)
+    hit, passed = (feature_sums(part, *parameters) for part in (hits, free))
+    doubts = torch.where(hit > HIT, 0, known.doubts + passed)
     return doubts * known.is_occupied
 
 

@@ -138,7 +138,7 @@ def _divide(known: MapState, rule: Rule) -> Groups:
     chosen = torch.cat(rows)
     if len(chosen) == 0:
         return Groups(light, known.evidence, kinds, divided)
-    first, second = halves(known.evidence[chosen])
+    first, second = halves(known.evidence.index_select(0, chosen))
     sizes = torch.stack([kept_counts(first), kept_counts(second)])
     balanced = (sizes.amin(dim=0) >= MIN_COUNT).nonzero().squeeze(1)
     chosen, first, second = chosen[balanced], first[balanced], second[balanced]
@@ -291,4 +291,4 @@ def _reassigned(
     state = replace(state, evidence=evidence, fresh=fresh)
     sizes = kept_counts(evidence)
     moved = ((sizes > 0) & ((new > 0) | (sizes != groups.sizes))).nonzero().squeeze(1)
-    return following(state, moved, evidence[moved], num_known, floor)
+    return following(state, moved, evidence.index_select(0, moved), num_known, floor)

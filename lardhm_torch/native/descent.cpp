@@ -174,9 +174,6 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
   return state;
 }
 
-// -y log y, 0 at both ends of [0, 1].
-double entropy_part(double label) { return label > 0 ? -label * std::log(label) : 0; }
-
 // Loss of each row in excess of that of a perfect prediction.
 Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
                      const Tensor& given_labels, const Tensor& given_weights) {
@@ -192,9 +189,10 @@ Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
     for (int64_t row = 0; row < n; ++row, index += k, value += k) {
       T sum = 0;
       for (int64_t j = 0; j < k; ++j) sum += value[j] * in<T>(weights)[index[j]];
-      const double at = double(sum), label = double(in<T>(labels)[row]);
-      const double loss = std::max(at, 0.0) - at * label + std::log1p(std::exp(-std::abs(at)));
-      out<T>(losses)[row] = T(loss - entropy_part(label) - entropy_part(1 - label));
+      const T label = in<T>(labels)[row], other = 1 - label;
+      T loss = std::max(sum, T(0)) - sum * label + std::log1p(std::exp(-std::abs(sum)));
+      if (label > 0 && other > 0) loss += label * std::log(label) + other * std::log(other);
+      out<T>(losses)[row] = loss;
     }
   };
   values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});

@@ -137,6 +137,10 @@ struct Merger {
       const auto one = candidate(points + int64_t(rows[i]) * D);
       if (!full || one < kept.back()) added.push_back(one);
     }
+    if (added.empty() && !cleared) {
+      write(kept, size, to);
+      return 0;
+    }
     std::sort(added.begin(), added.end());
     std::merge(kept.begin(), kept.end(), added.begin(), added.end(), std::back_inserter(merged));
     merged.erase(std::unique(merged.begin(), merged.end()), merged.end());
