@@ -21,7 +21,7 @@ from lardhm_torch.io.atomic_files import remove_partials, replaced_file
 from lardhm_torch.learning import packing
 from lardhm_torch.learning.clustering import scan_clusters, split_labels
 from lardhm_torch.learning.update import UpdateConfig
-from lardhm_torch.native.thinning import one_per_cell
+from lardhm_torch.native.thinning import few_per_cell
 from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays, spread_rows
 from lardhm_torch.scans import Scans, seeded_generator
 
@@ -63,7 +63,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
     return replace(
         config,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(config.update, spacing=0.1, max_points=10_000, max_trained=2_000),
+        update=replace(config.update, cell_edge=0.2, max_points=10_000, max_trained=2_500),
     )
 
 
@@ -188,7 +188,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
 
 
 def _thinned(scan: Scans, config: StreamConfig, rng: torch.Generator) -> Scans:
-    """The rays of a scan that are used: at most ``max_rays``, and of those that end in one cell, one.
+    """The rays of a scan that are used: at most ``max_rays``, and of those that end in one cell, four.
 
     Of the others, at most ``max_points`` with and ``max_points`` without a hit are drawn. All hits are
     used if they have channels.
@@ -198,8 +198,8 @@ def _thinned(scan: Scans, config: StreamConfig, rng: torch.Generator) -> Scans:
         scan = scan.select(rows.sort().values)
     if scan.channels:
         return scan
-    spacing, limit = config.update.spacing, config.update.max_points
-    rows = one_per_cell(scan.ends, scan.is_return.long(), spacing)
+    limit = config.update.max_points
+    rows = few_per_cell(scan.ends, scan.is_return.long(), config.update.cell_edge)
     is_return = scan.is_return[rows]
     parts = [rows[is_return], rows[~is_return]]
     parts = [p[spread_rows(len(p), limit, rng)] if len(p) > limit else p for p in parts]

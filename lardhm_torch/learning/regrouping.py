@@ -287,8 +287,9 @@ def _reassigned(
         if len(rows) and len(own):
             target[own] = rows[_nearest(moving[own], state.means[rows])]
     evidence, new = add_points(evidence, changed, moving, target)
-    fresh = state.fresh + new.to(state.fresh)
-    state = replace(state, evidence=evidence, fresh=fresh)
     sizes = kept_counts(evidence)
-    moved = ((sizes > 0) & ((new > 0) | (sizes != groups.sizes))).nonzero().squeeze(1)
+    lost = (groups.sizes + new - sizes).clamp(min=0)
+    fresh = state.fresh + torch.maximum(new, lost).to(state.fresh)
+    state = replace(state, evidence=evidence, fresh=fresh)
+    moved = ((sizes > 0) & ((new > 0) | (lost > 0))).nonzero().squeeze(1)
     return following(state, moved, evidence.index_select(0, moved), num_known, floor)

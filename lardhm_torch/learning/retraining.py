@@ -25,7 +25,7 @@ from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 256  # clusters that are chosen for training together
-MIN_BATCHES = 8  # per pass, so that few points give enough steps, too
+MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
 
@@ -59,8 +59,7 @@ def retrained(
     sizes = torch.bincount(owners, minlength=len(state))
     factors = balanced(state.kinds, evidence_weights(state), config, sizes) * trust(state.doubts)
     labels, factors = KIND_LABELS.to(points)[state.kinds][owners], factors[owners]
-    fewest = max(1, len(points) // MIN_BATCHES)
-    config = replace(config, batch_size=min(config.rows_per_batch(len(points)), fewest))
+    config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
     weights, (rows, losses) = trained(state, index, (points, labels, factors), task)
     owners = owners[rows]
@@ -72,6 +71,14 @@ def retrained(
         losses=torch.where(found > 0, losses, state.losses),
         fresh=state.fresh.masked_fill(moving, 0),
     )
+
+
+def _with_enough_steps(config: FitConfig, num_points: int) -> FitConfig:
+    """Training settings with smaller batches and more passes if there are few points."""
+    largest = max(1, num_points // MIN_BATCHES)
+    config = replace(config, batch_size=min(config.rows_per_batch(num_points), largest))
+    batches = -(-num_points // config.rows_per_batch(num_points))
+    return replace(config, passes=max(config.passes_over(num_points), -(-MIN_STEPS // batches)))
 
 
 def trained(

@@ -32,7 +32,7 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
-from lardhm_torch.native.thinning import one_per_cell
+from lardhm_torch.native.thinning import few_per_cell
 from lardhm_torch.sampling import UNKNOWN, spread_rows
 
 MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
@@ -48,13 +48,13 @@ class UpdateConfig:
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
     split_loss: float = 0.01  # clusters whose points have a larger mean loss are divided
-    spacing: float = 0.05  # [m] of each class one new point is used in each cell of this edge
+    cell_edge: float = 0.1  # [m] of each class at most four new points are used in each cell
     max_points: int = 20_000  # new points of each class that are used; more are drawn at random
     max_trained: int = 5_000  # changed clusters that are trained; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
-        for name in ("zeta", "split_loss", "spacing", "max_points", "max_trained"):
+        for name in ("zeta", "split_loss", "cell_edge", "max_points", "max_trained"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0; got {getattr(self, name)}")
 
@@ -138,11 +138,11 @@ def _without(nearby: Tensor, part: MapState, alive: Tensor) -> Changes:
 def _thinned(
     points: Tensor, labels: Tensor, config: UpdateConfig, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """One sample of each label in each cell, and of these a stratified random subset if there are more.
+    """A few samples of each label in each cell, and of these a stratified random subset if there are more.
 
     The samples of a scan are dense near the sensor. Evenly spread ones train the map better.
     """
-    chosen = one_per_cell(points, (2 * labels).long(), config.spacing)
+    chosen = few_per_cell(points, (2 * labels).long(), config.cell_edge)
     points, labels = points.index_select(0, chosen), labels.index_select(0, chosen)
     rows, limit = [], config.max_points
     for label in (1.0, 0.0, UNKNOWN):

@@ -332,8 +332,8 @@ def _register() -> None:
     def _(points: Tensor, owners: Tensor, num_clusters: int, size: int) -> Tensor:
         return points.new_empty(num_clusters, size, points.shape[1])
 
-    @library.register_fake("lardhm::one_per_cell")
-    def _(points: Tensor, groups: Tensor, edge: float) -> Tensor:
+    @library.register_fake("lardhm::few_per_cell")
+    def _(points: Tensor, groups: Tensor, edge: float, most: int) -> Tensor:
         return groups.new_empty(library.get_ctx().new_dynamic_size())
 
     @library.register_fake("lardhm::add_points")

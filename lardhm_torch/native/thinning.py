@@ -1,4 +1,4 @@
-"""Random choices that depend on the points alone: priorities, and one point of each cell.
+"""Random choices that depend on the points alone: priorities, and a few points of each cell.
 
 The same points give the same choice, in whatever order and at whatever time they come.
 """
@@ -13,7 +13,8 @@ from lardhm_torch import native
 MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
 BITS = 31  # of a priority
 FARTHEST = 1e15  # numbers of cells are limited to this; those of NaN, too
-CELLS = 0x27D4EB2F  # start of the hash that chooses a point of a cell: independent of the others
+CELLS = 0x27D4EB2F  # start of the hash that chooses points of a cell: independent of the others
+PER_CELL = 4  # points of a cell
 
 
 def priorities(points: Tensor, start: int = 0) -> Tensor:
@@ -30,20 +31,21 @@ def priorities(points: Tensor, start: int = 0) -> Tensor:
     return mixed >> (32 - BITS)
 
 
-def one_per_cell(points: Tensor, groups: Tensor, edge: float) -> Tensor:
-    """Ascending rows of one random point of each group in each cell of a lattice.
+def few_per_cell(points: Tensor, groups: Tensor, edge: float) -> Tensor:
+    """Ascending rows of at most `PER_CELL` random points of each group in each cell of a lattice.
 
     Args:
         points: (N, D) positions [m].
-        groups: (N,) int64; points of different groups may share a cell.
+        groups: (N,) int64; points of different groups do not compete for a cell.
         edge: of the cells [m].
     """
     if native.supports(points):
-        return torch.ops.lardhm.one_per_cell(points.detach(), groups, edge)
-    order = priorities(points, CELLS).argsort(stable=True)
+        return torch.ops.lardhm.few_per_cell(points.detach(), groups, edge, PER_CELL)
     cells = (points / edge).floor().clamp(-FARTHEST, FARTHEST).nan_to_num(FARTHEST).long()
-    _, owners = torch.cat([cells, groups[:, None]], dim=1)[order].unique(dim=0, return_inverse=True)
+    _, owners = torch.cat([cells, groups[:, None]], dim=1).unique(dim=0, return_inverse=True)
+    order = priorities(points, CELLS).argsort(stable=True)
+    order = order[owners[order].argsort(stable=True)]
+    sizes = torch.bincount(owners)
     place = torch.arange(len(order), device=order.device)
-    first = torch.full_like(place, len(order))
-    first.scatter_reduce_(0, owners, place, "amin")
-    return order[first[first < len(order)]].sort().values
+    place -= (sizes.cumsum(0) - sizes)[owners[order]]
+    return order[place < PER_CELL].sort().values
