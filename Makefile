@@ -4,8 +4,8 @@
 # make test      run linter, type checker and all tests
 # make check     the same with the quickest tests of every part
 # make docs      build the documentation (out/docs/index.html); warnings are errors
-# make wheel     build the pure wheel and the one for Linux on x86-64 with the kernel (out/wheels/)
-# make try-wheel install the latter without a compiler; compare its speed with a kernel compiled here
+# make wheel     build the pure wheel and the one for Linux on x86-64 with the native library (out/wheels/)
+# make try-wheel install the latter without a compiler; compare its speed with a library compiled here
 # make versions  try that wheel with old and new versions of Python and the libraries (gigabytes)
 # make sanitize  run the native tests with AddressSanitizer and UndefinedBehaviorSanitizer (minutes)
 # make bench     run the benchmarks (minutes)
@@ -60,14 +60,14 @@ export MPLBACKEND := Agg
 	touch $@
 
 demo: .venv/demo
-	@echo "running the demo: about a minute, most of it to compile the kernel the first time"
+	@echo "running the demo: about a minute, most of it to compile the native library the first time"
 	$(BIN)/python scripts/demo.py out
 
 test: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	@$(BIN)/python -c "from lardhm_torch import native; native.available()"  # compile the kernel once
+	@$(BIN)/python -c "from lardhm_torch import native; native.available()"  # compile the native library once
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) $(LONG:%=--deselect %)
 
 check: .venv/ready

@@ -35,12 +35,12 @@ from lardhm_torch import (
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 from lardhm_torch.learning.fitting import fit_weights
 
-Kernel = Callable[[Tensor], Tensor]  # distance in length-scales -> closeness
+Kernel = Callable[[Tensor], Tensor]  # distance in length scales -> closeness
 
 HEAD = """# Ablation study
 
-Balanced accuracy unif / near in percent, and log-loss unif / near, with one change at a time; at most
-{rays:,} rays of a set, half of which train, seed {seed}. The defaults were chosen on these sets.
+Balanced accuracy unif / near in percent, and log-loss unif / near. Each row changes one default. At most
+{rays:,} rays of a set, half of them for training, seed {seed}. The defaults were chosen on these sets.
 Produced by `benchmarks/choices.py`.
 
 """
@@ -64,7 +64,7 @@ def matern_three_halves(d: Tensor) -> Tensor:
 
 
 def wendland(d: Tensor) -> Tensor:
-    """Compactly supported, twice differentiable; 0 beyond 3.5 length-scales."""
+    """Compactly supported, twice differentiable; 0 beyond 3.5 length scales."""
     r = (d / 3.5).clamp(max=1)
     return (1 - r) ** 4 * (4 * r + 1)
 
@@ -88,7 +88,7 @@ CHOICES = {
     "one cluster per 30 hits": Choice(hits_per_cluster=30),
     "no near samples": Choice(sampling={"near_samples": 0}),
     "1 near sample": Choice(sampling={"near_samples": 1}),
-    "3 free samples a ray": Choice(sampling={"free_samples": 3}),
+    "3 free samples per ray": Choice(sampling={"free_samples": 3}),
     "near margin 0.2 m": Choice(sampling={"near_margin": 0.2}),
     "near margin 0.05 m": Choice(sampling={"near_margin": 0.05}),
     "equal class weights": Choice(fit={"occupied_share": 0.5}, tune={"occupied_share": 0.5}),
@@ -97,7 +97,7 @@ CHOICES = {
     "no stiffness": Choice(tune={"stiffness": 0.0}),
     "8 epochs": Choice(tune={"epochs": 8}),
     "best epoch on 10 % of the rays": Choice(tune={"hold_out": 0.1}),
-    "length-scales frozen": Choice(tune={"tune_scales": False}),
+    "length scales frozen": Choice(tune={"tune_scales": False}),
     "centers frozen": Choice(tune={"tune_centers": False}),
     "**default, not fine-tuned**": Choice(tune=None),
     "k = 8, not fine-tuned": Choice(model={"num_neighbors": 8}, tune=None),

@@ -13,7 +13,7 @@ from lardhm_torch import cli
 HERE = Path(__file__).parent
 EXIT_CODES = (
     "Exit code: 0 on success; 1 after an error, which is reported in one line; "
-    "2 for an invalid command line."
+    "2 for an invalid command line; 130 after Ctrl-C."
 )
 project = "lardhm_torch"
 author = "The lardhm_torch developers"
@@ -33,14 +33,19 @@ napoleon_google_docstring = True
 autodoc_mock_imports: list[str] = []
 
 
-FIELD = re.compile(r"^    (\w+): .* = .+?  # (.+)$", re.MULTILINE)
+# A field of a settings class, with a comment in the lines above it or behind it.
+FIELD = re.compile(r"((?:^    # .+\n)*)^    (\w+): [^#\n]+ = [^#\n]+?(?:  # (.+))?$", re.MULTILINE)
 
 
 def add_settings(obj, lines):
     """Append the fields of a settings class, which comments in its source describe."""
-    fields = FIELD.findall(inspect.getsource(obj))
+    fields = []
+    for above, name, behind in FIELD.findall(inspect.getsource(obj)):
+        text = behind or " ".join(line.strip(" #") for line in above.splitlines())
+        if text:
+            fields.append(f"- ``{name}``: {text}")
     if fields:
-        lines += ["", *(f"- ``{name}``: {text}" for name, text in fields), ""]
+        lines += ["", *fields, ""]
 
 
 def plain_text(app, what, name, obj, options, lines):

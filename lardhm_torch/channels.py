@@ -1,4 +1,4 @@
-"""Values beside positions: color, intensity and other columns by name, and class labels.
+"""Additional values of rays and points: color, intensity, class labels and others, by name.
 
 Channels are a dictionary of tensors with one row per ray or point:
 
@@ -7,7 +7,7 @@ Channels are a dictionary of tensors with one row per ray or point:
 - ``"color"``: (N, 3) red, green and blue, 0 to 1, NaN where missing;
 - any other name: (N,) or (N, C) float values, NaN where missing.
 
-A missing value stays missing everywhere: it is counted, and never taken for zero.
+A missing value stays missing everywhere; it never counts as zero.
 """
 
 from __future__ import annotations

@@ -290,7 +290,7 @@ def mixture(
         scale_tril: (M, D, D) lower Cholesky factors of the covariances [m].
         table: (M, C, 1 + D) values t and gradients g [1/m], or (M, C, 1) values alone.
         indices: (N, K) the K nearest clusters of each point.
-        sharp: weight by the fourth power of the features, whose kernel has half the length-scales.
+        sharp: weight by the fourth power of the features, whose kernel has half the length scales.
 
     Returns:
         (N, C) sums; NaN for points that are not finite.

@@ -13,6 +13,7 @@ from torch import Tensor
 from lardhm_torch.channels import CLASS, Channels, check_channels
 from lardhm_torch.io import map_files
 from lardhm_torch.learning import (
+    aging,
     channel_sums,
     class_training,
     map_merging,
@@ -23,11 +24,10 @@ from lardhm_torch.learning import (
 from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask
-from lardhm_torch.learning.map_state import HISTORY
 from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.scene_clusters import fit_scene
 from lardhm_torch.learning.sized_maps import SMALL, fit_size
-from lardhm_torch.learning.state_dicts import occupied_sums
+from lardhm_torch.learning.state_dicts import file_state
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
@@ -37,11 +37,12 @@ from lardhm_torch.scans import seeded_generator
 class LardHilbertMap(MapQueries):
     """Continuous occupancy map whose log-odds are a weighted sum of local kernel features.
 
-    The probability is exactly 1/2 in an empty map and far from all clusters. Points are
-    given in the world frame; ``origin`` is subtracted in float64 before they are cast to the map's
-    dtype, so coordinates may be far from zero. Maps of half precision answer in their dtype and compute
-    in float32; they cannot be trained. A point with a NaN or infinite coordinate has
-    probability NaN. Tensors, NumPy arrays and lists are accepted as points.
+    The log-odds are the logit of the probability of occupancy. The probability is exactly 1/2 in an
+    empty map and far from all clusters. Points are given in the world frame; ``origin`` is subtracted
+    in float64 before they are cast to the map's dtype, so coordinates may be far from zero. Maps of
+    half precision compute in float32 and return results in their own dtype; they cannot be trained. A
+    point with a NaN or infinite coordinate has probability NaN. Tensors, NumPy arrays and lists are
+    accepted as points.
 
     Args:
         dim: number of coordinates D.
@@ -56,17 +57,18 @@ class LardHilbertMap(MapQueries):
         weights: (M,) parameter, weights of the features.
         centers: (M, D) parameter [m], map frame.
         raw_scale_tril: (M, D, D) parameter, lower Cholesky factors with log-transformed diagonals, so
-            that any value is valid. `scale_tril` holds the factors of the kernels [m].
+            that any value is valid. `scale_tril` has the factors of the kernels [m].
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
             clusters of unknown points have count 0.
-        evidence: (M, 32, D) buffer [m], points kept by the clusters, padded with infinity.
-        losses, doubts, fresh: (M,) buffers, used by `update` (see docs).
+        evidence: (M, 32, D) buffer [m], kept points: a bounded random sample of the points of each
+            cluster, padded with infinity.
+        losses, doubts, fresh, times: (M,) buffers, used by `update` (see docs).
+        max_age: `update` removes clusters that were not seen for longer [s]; None: never. Saved.
         posterior_means, posterior_variances: (M,) buffers, written by `fit_uncertainty`; a variance
             of 0 means that the posterior has not been computed.
         posterior_scales: (2,) buffer, factors on negative and positive posterior log-odds.
         origin: (D,) float64 buffer [m], world = map + origin; stays float64 under any cast.
-        channel_sums: (M, R, 1 + D) float64 buffer of a map that was given channels, else None; what
-            `channels` shows by name.
+        channel_sums: (M, R, 1 + D) float64 buffer of a map with channels, else None; see `channels`.
         class_weights: (M, K) parameter of a map whose classes were trained (`fit_classes`), else None.
 
     Source: Guizilini & Ramos 2016, eq. (1), (8), (9).
@@ -85,24 +87,23 @@ class LardHilbertMap(MapQueries):
         progress: bool = False,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
-        """Fit the map to labelled points. Existing clusters are discarded.
+        """Fit the map to labeled points. Existing clusters are discarded.
 
-        Each class is clustered separately. The moments of the clusters determine centers and
-        length-scales, and then the weights are trained. With ``max_bytes`` or
-        ``FitConfig(shape_passes=4)`` centers and length-scales of fewer clusters are trained, too
-        (`scene_clusters`). If anything fails, the map is unchanged.
+        Occupied, free and unknown points are clustered separately. The mean and covariance of the
+        points of a cluster determine its center and length scales. Then the weights are trained. With
+        ``max_bytes`` or ``FitConfig(shape_passes=4)``, the map has fewer clusters, and their centers
+        and length scales are trained, too (`scene_clusters`). If anything fails, the map is unchanged.
 
         Args:
             points: (N, D) world positions [m].
             labels: (N,) 1 occupied, 0 free, 1/2 unknown; a single class is allowed.
-            num_clusters: total over both classes, half each; a class too small for its half
-                leaves the remainder to the other. None: chosen from the data
-                (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
+            num_clusters: total, divided 1 : 2 : 1 between occupied, free and unknown points, or 1 : 1
+                without unknown points; other classes get what a class has too few points for. None:
+                chosen (`clustering.choose_num_clusters`, or `scene_clusters.needed_clusters`).
             seed: random seed of clustering and training.
-            max_bytes: instead of a number of clusters, the size of the file that `pack` writes: the map
-                gets as many clusters as fit into it.
-            channels: values of the points by name, such as `Samples.channels`; those of the occupied
-                points are summed up in the clusters. They do not change the occupancy.
+            max_bytes: instead of ``num_clusters``, the maximum size of the file that `pack` writes.
+            channels: additional values of the points by name, such as `Samples.channels`; the clusters
+                accumulate those of the occupied points. They do not affect the occupancy.
             progress: show a progress bar on a terminal.
             config: training settings.
 
@@ -110,7 +111,7 @@ class LardHilbertMap(MapQueries):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, no points,
+            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, no points,
                 num_clusters is not a positive integer, max_bytes is too small or given together with
                 num_clusters, or a channel is invalid.
 
@@ -148,10 +149,10 @@ class LardHilbertMap(MapQueries):
         wrong_labels: float = 0.0,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
-        """Train ``class_weights`` on labelled points by the multinomial log-loss.
+        """Train ``class_weights`` on labeled points with the multinomial log-loss.
 
         An empty map becomes a multi-class Hilbert map without occupancy: the points of each class are
-        clustered apart, in any dimension and unit, and the probability of occupancy stays 1/2. A
+        clustered separately, in any dimension and unit, and the probability of occupancy stays 1/2. A
         fitted map without classes first gets the class counts of the points. Occupancy and clusters
         of a fitted map do not change. If anything fails, the map is unchanged.
 
@@ -161,7 +162,7 @@ class LardHilbertMap(MapQueries):
             num_clusters: number of clusters of an empty map; None: one per 30 points of a class.
             seed: random seed of clustering and training.
             wrong_labels: fraction of the labels that are those of a random other class. The map then
-                answers for the true class.
+                predicts the true class instead of the label.
             config: training settings.
 
         Returns:
@@ -204,11 +205,11 @@ class LardHilbertMap(MapQueries):
     def calibrate_classes(
         self, points: TensorLike, classes: TensorLike, *, wrong_labels: float = 0.0
     ) -> LardHilbertMap:
-        """Set ``class_scale``, the factor on the class log-odds, to the most likely one for some labels.
+        """Fit ``class_scale``, the factor on the class log-odds, to labels by maximum likelihood.
 
-        The counts of a cluster answer for a random one of its labels. If a few of them are wrong, they
-        are too cautious about its true class. The factor changes confidences, and no most likely
-        class. Use points that the map has not seen, such as the next scan before it is added.
+        The class counts of a cluster give the distribution of its labels, which is underconfident about
+        the true class if a few labels are wrong. The factor does not change which class is most likely.
+        Use points on which the map was not trained, such as those of the next scan before it is added.
 
         Args:
             points: (N, D) world positions on surfaces [m].
@@ -241,7 +242,7 @@ class LardHilbertMap(MapQueries):
 
         Args:
             points: (N, D) world positions [m].
-            labels: (N,) 1 occupied, 0 free.
+            labels: (N,) 1 occupied, 0 free; unknown points (1/2) are left out.
 
         Returns:
             This map.
@@ -267,59 +268,62 @@ class LardHilbertMap(MapQueries):
         *,
         seed: int = 0,
         channels: Channels | None = None,
+        time: float | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
-        """Update the map with one more scan, without forgetting. On an empty map this is `fit`.
+        """Update the map with one more scan. On an empty map this is `fit`.
 
-        Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
-        near them are regrouped, and the weights there are trained on the kept points. Parameters
-        remain the same objects (see `parameters.resize_optimizer` for stateful optimizers). Clusters
-        without points are removed, and the last rows take their places. If anything fails, the map
-        is unchanged.
+        Each cluster keeps a bounded random sample of its points, the kept points. New points are added
+        to it, clusters near the new points are regrouped, and their weights are trained on the kept
+        points. Obstacles that scans contradict disappear after a few updates. Parameters remain the
+        same objects (see `parameters.resize_optimizer`). The last rows take the places of removed
+        clusters. If anything fails, nothing changes.
 
         Args:
             points: (N, D) world positions [m]; an empty set leaves the map unchanged.
             labels: (N,) 1 occupied, 0 free, 1/2 unknown.
-            num_clusters: maximum number of clusters near the points, over all classes. None: chosen
-                from the number of hits there.
+            num_clusters: maximum number near the points, over all classes; None: chosen from them.
             seed: random seed of clustering and training.
             channels: see `fit`; channels and classes that are new to the map are added to it.
-            config: update settings; `UpdateConfig(as_in_paper=True)` follows the paper.
+            time: time stamp of the scan [s]; required if the map has a ``max_age``.
+            config: update settings; `UpdateConfig(as_in_paper=True)` selects Algorithm 2 of the paper.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels not 0 or 1, num_clusters is not a
-                positive integer, or a channel is invalid or of another width than in the map.
+            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, num_clusters
+                is not a positive integer, a channel is invalid, or a time is missing.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
         self.check_learns()
+        aging.check_time(time, self.max_age)
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:
-            return self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+            self.fit(points, labels, num_clusters, seed=seed, channels=channels)
+            return aging.stamped(self, time)
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers, self.origin, keep_unknown=True)
         check_num_clusters(num_clusters)
         rng = seeded_generator(seed, "update", self.centers.device)
         task = Task(self.kernel, config or UpdateConfig(), rng)
         hits = channel_sums.hits_with_channels(*samples[:2], channels)
-        old = self.channel_layout
-        layout = channel_sums.joint_layout(old, channel_sums.layout_of(hits.channels))
-        state = channel_sums.with_layout(parameters.read_state(self), old, layout)
+        state = parameters.read_state(self)
+        state, layout = channel_sums.with_layout_of(hits, state, self.channel_layout)
         changes = updated(state, *samples[:2], num_clusters, task)
         part = channel_sums.with_hits(changes.part, layout, hits)
+        part = aging.timed(part, *samples[:2], self.kernel, time)
         parameters.write_rows(self, changes.where, part, changes.removed, layout)
+        aging.forget_old(self, time)
         return self
 
     @changes_map
     def transform(self, rotation: Tensor, translation: Tensor) -> LardHilbertMap:
         """Apply the rigid transform x -> rotation x + translation to the map.
 
-        The transform is exact and needs no training, so that a submap can be moved to its new pose
-        after a loop closure. The posterior of the weights is kept.
+        The transform is exact, for example after a loop closure. The posterior is kept.
 
         Args:
             rotation: (D, D) orthonormal, determinant 1.
@@ -340,8 +344,8 @@ class LardHilbertMap(MapQueries):
     def crop(self, center: Tensor, radius: float) -> LardHilbertMap:
         """Remove all clusters farther than ``radius`` [m] from a world position (D,).
 
-        Clusters of surfaces and of unknown space that limit the remaining free space stay, so that
-        places beyond the radius do not become free. The posterior of the other weights is kept.
+        Clusters of surfaces and of unknown space that limit the remaining free space are kept, so that
+        space beyond the radius does not become free. The posterior of the other weights is kept.
 
         Returns:
             This map.
@@ -362,19 +366,16 @@ class LardHilbertMap(MapQueries):
 
         Args:
             path: file; the extension ``.safetensors`` selects that format.
-            evidence: write the points kept by the clusters, too. Without them the file is about a
-                quarter as large, and a later `update` draws points from the clusters' moments.
+            evidence: also write the kept points. Without them the file is about a quarter as large,
+                and a later `update` draws points from the Gaussians of the clusters.
         """
         with self.lock.reading():
-            state = self.state_dict()
-            if not evidence:
-                state = {name: value for name, value in state.items() if name not in HISTORY}
-            map_files.save_state(occupied_sums(state), path)
+            map_files.save_state(file_state(self.state_dict(), evidence), path)
 
     def pack(self, path: str | os.PathLike[str], *, precision: int = packing.PRECISION) -> None:
-        """Write a small file, about 12 bytes per cluster in 3-D, of a map that answers but cannot learn.
+        """Write a compact file, about 12 bytes per cluster in 3-D, for queries only.
 
-        Channels take about 10 more bytes for each color of an occupied cluster.
+        A packed map cannot be trained or updated. Colors take about 10 more bytes per occupied cluster.
 
         Args:
             path: file, usually ``.lhm``.

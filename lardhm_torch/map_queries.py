@@ -20,7 +20,7 @@ from lardhm_torch.native.surfaces import NativeMap
 
 
 class MapQueries(parameters.MapParameters):
-    """What `LardHilbertMap` answers; see there."""
+    """The queries of `LardHilbertMap`; see there."""
 
     @reads_map
     def forward(self, points: TensorLike) -> Tensor:
@@ -29,7 +29,7 @@ class MapQueries(parameters.MapParameters):
 
     @reads_map
     def log_odds(self, points: TensorLike) -> Tensor:
-        """(..., D) world positions [m] -> (...) log-odds of occupancy, w^T Phi(x)."""
+        """(..., D) world positions [m] -> (...) log-odds of occupancy (logit), w^T Phi(x)."""
         return self._query(points, probability=False)
 
     @reads_map
@@ -51,7 +51,7 @@ class MapQueries(parameters.MapParameters):
         Far from all clusters it equals the variance of the prior.
 
         Raises:
-            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
+            RuntimeError: `fit_uncertainty` was not called after the last change of the clusters.
         """
         return self._as_answer(self._posterior(points)[1])
 
@@ -60,7 +60,7 @@ class MapQueries(parameters.MapParameters):
         """(..., D) world positions [m] -> (...) probability, averaged over the posterior of the weights.
 
         Raises:
-            RuntimeError: `fit_uncertainty` was not called since the clusters changed.
+            RuntimeError: `fit_uncertainty` was not called after the last change of the clusters.
         """
         mean, variance = self._posterior(points)
         return self._as_answer(posterior.moderate(mean, posterior.VARIANCE_FACTOR * variance))
@@ -74,9 +74,10 @@ class MapQueries(parameters.MapParameters):
     def channel(self, points: TensorLike, name: str) -> Tensor:
         """(..., D) world positions [m] -> (...) or (..., C) mean of a channel around them.
 
-        The means of the occupied clusters nearby are averaged with the fourth power of their features,
-        whose kernel has the covariance of the points of a cluster, times their numbers of hits. NaN
-        where no occupied cluster with a value is near. For ``"class"``: `class_probability`.
+        This is a weighted mean over the nearest occupied clusters, each with the linear trend of its
+        values. The weight is the number of hits times the fourth power of the feature, which is a
+        Gaussian with the covariance of the points of the cluster. The result is NaN if no occupied
+        cluster with a value is near. For ``"class"`` it is `class_probability`.
 
         Raises:
             ValueError: the map has no such channel.
@@ -88,9 +89,9 @@ class MapQueries(parameters.MapParameters):
         """(..., D) world positions [m] -> (..., K) logarithms of the class odds, up to a constant.
 
         K is the number of classes, in the order of ``classes``. The value is the logarithm of the
-        posterior of the class counts around a point, plus the trained class weights times the
-        features (`fit_classes`). It is differentiable with respect to the points, ``class_weights``,
-        ``centers`` and ``raw_scale_tril``.
+        class posterior from the counts around a point, times ``class_scale``, plus the trained class
+        weights times the features (`fit_classes`). It is differentiable with respect to the points,
+        ``class_weights``, ``centers`` and ``raw_scale_tril``.
 
         Raises:
             ValueError: the map has no classes.
@@ -145,7 +146,7 @@ class MapQueries(parameters.MapParameters):
     @torch.no_grad()
     @reads_map
     def query_lattice(self, axes: Sequence[Tensor], probability: bool = True) -> Tensor:
-        """Probability or log-odds at all points of a lattice, faster than one by one.
+        """Probability or log-odds at all points of a lattice, faster than for a list of the points.
 
         Args:
             axes: D lists of world coordinates [m]; the lattice is their Cartesian product.

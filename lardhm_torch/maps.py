@@ -85,12 +85,12 @@ def to_tensor(values: TensorLike, name: str, device: torch.device | str | None =
 
 
 def reading(model: OccupancyMap) -> AbstractContextManager[None]:
-    """A context in which no other thread changes the map, if it has ``reading``."""
+    """A context in which no other thread changes the map, if the map has ``reading``."""
     return model.reading() if hasattr(model, "reading") else nullcontext()
 
 
 def reads_map(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function of a map, its first argument, so that it sees one state of the map."""
+    """Decorator for a function whose first argument is a map: no thread changes the map meanwhile."""
 
     @functools.wraps(function)
     def read(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -104,9 +104,9 @@ def reads_map(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def reads_copy(function: Callable[P, R]) -> Callable[P, R]:
-    """As `reads_map`, for functions that take long: they read a copy, and the map can change meanwhile.
+    """As `reads_map`, for slow functions: they get a copy, and the map can change meanwhile.
 
-    A map without ``reading``, such as a tiled one, is read itself.
+    A map without ``reading``, such as a tiled map, is not copied.
     """
 
     @functools.wraps(function)
@@ -179,7 +179,7 @@ def stored_moments(model: OccupancyMap) -> tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def kept_hits(model: OccupancyMap) -> Tensor | None:
-    """(M, K, D) points that the clusters keep, map frame, padded with infinity; None if not stored."""
+    """(M, K, D) kept points of the clusters, map frame, padded with infinity; None if not stored."""
     evidence = getattr(model, "evidence", None)
     return None if evidence is None or evidence.shape[1] == 0 else evidence.detach()
 

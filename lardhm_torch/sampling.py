@@ -1,4 +1,4 @@
-"""Rays to training pairs: hits are occupied, points before them free, points behind unknown."""
+"""Training points from rays: hits are occupied, points before them free, points behind unknown."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from lardhm_torch.native.crossings import Lines, never_crossed, passages
 from lardhm_torch.scans import Scans, seeded_generator
 
 UNKNOWN = 0.5  # label of points in unobserved space
-LOST = 0.5  # of the hits outside the range limits: more than that is a mistake of units
+LOST = 0.5  # if a larger fraction of the hits is outside the range limits, the units are wrong
 
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig:
-    """How rays become labelled points.
+    """Settings of the labeled points that are sampled from rays.
 
-    The paper takes one free sample every one to two meters of a ray (Section II-A). On its own
-    that leaves the last stretch before the surface, where the map must turn from free to occupied,
-    almost without data; ``near_samples`` adds points there.
+    The paper takes one free sample every one to two meters of a ray (Section II-A). This leaves
+    almost no data in the last section before the surface, where the map must change from free to
+    occupied. ``near_samples`` adds points there.
     """
 
-    min_range: float = 0.3  # [m] shorter rays end in the sensor's own body and are dropped
-    max_range: float = 100.0  # [m] beyond it a ray is cut and has no hit
-    free_samples: int = 6  # along every ray, one in each of as many equal stretches
+    min_range: float = 0.3  # [m] shorter rays end on the robot itself and are dropped
+    max_range: float = 100.0  # [m] longer rays are truncated and count as no-return
+    free_samples: int = 6  # free samples per ray, one in each of as many equal sections
     near_samples: int = 2  # free samples close in front of each hit
-    near_margin: float = 0.15  # [m] no free sample is closer to its own hit
-    near_reach: float = 0.6  # [m] the near samples lie between near_margin and this
-    behind_samples: int = 1  # unknown samples behind each hit, between the same two
-    # free samples where a ray passes through a flat surface that other rays hit; one elsewhere
+    near_margin: float = 0.15  # [m] minimum distance of free samples from the hit of their ray
+    near_reach: float = 0.6  # [m] maximum distance of near samples from the hit
+    behind_samples: int = 1  # unknown samples behind each hit, at the same distances
+    # free samples per ray that passes through a flat patch of other hits; 1 for other patches; 0: none
     passing_samples: int = 2
-    cell_edge: float = 0.1  # [m] of the cells that tell whether a ray was there
+    cell_edge: float = 0.1  # [m] edge of the cells used to test whether a ray crossed a place
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range < self.max_range < float("inf"):
@@ -60,20 +60,20 @@ class SamplingConfig:
 
 
 class NoUsableRayError(ValueError):
-    """Scans hold no ray that can be sampled; the message counts the reasons."""
+    """The scans contain no ray that can be sampled; the message counts the reasons."""
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Training pairs, world frame.
+    """Training pairs of points and labels, world frame.
 
     Args:
-        points: (N, D) float64 positions [m], the hits first, then free ones, unknown ones last.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown: no ray was there.
-        ray_id: (N,) which ray of the scans a point lies on.
+        points: (N, D) float64 positions [m]: hits first, then free points, then unknown points.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown (not observed by any ray).
+        ray_id: (N,) index of the ray that each point belongs to.
         dropped: number of rays left out, by reason.
-        channels: values of the points by name (`channels`): those of the rays at the hits, missing
-            (NaN, or class -1) at all other points.
+        channels: additional values of the points by name (see `channels`). Hits have those of their
+            rays; they are missing (NaN, or class -1) at all other points.
 
     Raises:
         ValueError: a channel does not have N rows, or one of its values is out of range.
@@ -94,9 +94,9 @@ class Samples:
         return len(self.points)
 
     def to(self, like: torch.device | str | torch.dtype) -> Samples:
-        """The same samples with points and labels on a device or of a floating point type.
+        """The same samples with points and labels on another device or of another floating point type.
 
-        World coordinates far from zero (UTM) lose digits in float32; maps accept float64 points.
+        World coordinates far from zero (UTM) lose precision in float32; maps accept float64 points.
         """
         points, labels = self.points.to(like), self.labels.to(like)
         if isinstance(like, torch.dtype):
@@ -106,7 +106,7 @@ class Samples:
 
 
 def usable_rays(scans: Scans, config: SamplingConfig) -> tuple[Tensor, dict[str, int]]:
-    """Which rays can be sampled, and how many of the others there are, by reason.
+    """Mask of the rays that can be sampled, and number of the other rays by reason.
 
     Returns:
         ((R,) mask, counts): NaN or infinite ends or origins; ends closer than ``min_range``
@@ -153,29 +153,29 @@ def sample_rays(
     seed: int = 0,
     max_points: int | None = None,
 ) -> Samples:
-    """Labelled points of the scans: hits occupied, points before them free, behind them unknown.
+    """Sample labeled points from scans: hits are occupied, points before them free, behind them unknown.
 
-    Each ray is cut into ``free_samples`` equal stretches and gives one uniform point in each
-    (stratified), plus ``near_samples`` close in front of its hit. A beam without return, and one
-    longer than ``max_range``, gives free space only, up to where it was seen to be free. Later
-    returns of a pulse (``target_index`` > 1) give a hit but no free space. Where a ray passes through a
-    surface that other rays hit (`crossings.passages`), as in an open door, lie ``passing_samples`` more
-    free points. Behind each hit lie ``behind_samples`` points of label 1/2, those of them where no other
-    ray went.
+    Each ray is divided into ``free_samples`` equal sections, with one uniform random point in each
+    (stratified sampling), and has ``near_samples`` more points close in front of its hit. A beam
+    without return, or one longer than ``max_range``, has free points only, up to its end or to
+    ``max_range``. Later returns of a pulse (``target_index`` > 1) have a hit but no free points. Where
+    a ray passes through a surface that other rays hit (`crossings.passages`), as in an open door,
+    there are ``passing_samples`` more free points. Behind each hit there are ``behind_samples``
+    unknown points (label 1/2), except where another ray crossed the cell.
 
     Args:
         scans: range scans, world frame.
-        config: spacings and limits; the defaults serve all scenes.
-        seed: of the random positions; the same seed gives the same samples.
-        max_points: maximum number of points of each label. A stratified random subset of all of them
-            is drawn, and only those points are computed. None: no limit.
+        config: numbers of samples and range limits; the defaults are suitable for all scenes.
+        seed: random seed of the positions.
+        max_points: maximum number of points of each label. A stratified random subset is drawn, and
+            only its points are computed. None: no limit.
 
     Returns:
-        Labelled points, the hits first, with the channels of their rays.
+        Labeled points, the hits first, with the channels of their rays.
 
     Raises:
         NoUsableRayError: no ray is usable, or more than half of the hits are outside the range
-            limits; a ValueError whose message says why.
+            limits. This is a ValueError whose message gives the reason.
 
     Source: Guizilini & Ramos 2016, Section II-A.
     """

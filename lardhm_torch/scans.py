@@ -15,7 +15,8 @@ from lardhm_torch.channels import Channels, check_channels, concatenate_channels
 class Scans:
     """Rays of one or more scans, in the world frame, as float64.
 
-    Ray r goes from ``origins[scan_id[r]]`` to ``ends[r]``. Coordinates may be far from zero (e.g. UTM).
+    Ray r starts at ``origins[scan_id[r]]`` and ends at ``ends[r]``. Coordinates may be far from zero
+    (e.g. UTM).
 
     Args:
         origins: (S, D) sensor position of each scan [m].
@@ -23,8 +24,9 @@ class Scans:
         scan_id: (R,) scan of each ray, 0 to S - 1; None: all rays belong to scan 0.
         is_return: (R,) True where the ray hit a surface; None: all rays did.
         target_index: (R,) 1 for the first return of a pulse, 2 for the second, ...; None: all 1.
-        channels: values of the rays by name, such as color, intensity and class (`channels`); NaN,
-            or -1 for a class, where a ray has none. None: no channels.
+        channels: additional values of the rays by name, such as color, intensity and class (see
+            `channels`); a missing value is NaN, or -1 for a class. None: no channels.
+        times: (S,) time stamp of each scan [s], NaN if unknown; None: no scan has one.
 
     Raises:
         ValueError: a tensor has the wrong shape, a scan_id has no origin, or a value of a channel is
@@ -37,6 +39,7 @@ class Scans:
     is_return: Tensor = field(default=None)  # type: ignore[assignment]
     target_index: Tensor = field(default=None)  # type: ignore[assignment]
     channels: Channels = field(default=None)  # type: ignore[arg-type]
+    times: Tensor | None = None
 
     def __post_init__(self) -> None:
         ends = torch.as_tensor(self.ends, dtype=torch.float64)
@@ -74,6 +77,13 @@ class Scans:
         object.__setattr__(self, "origins", origins)
         object.__setattr__(self, "ends", ends)
         object.__setattr__(self, "channels", check_channels(self.channels, rays, device))
+        if self.times is not None:
+            times = torch.as_tensor(self.times, dtype=torch.float64, device=device)
+            if times.shape != (len(origins),):
+                raise ValueError(
+                    f"times must be ({len(origins)},), one per scan; got {tuple(times.shape)}"
+                )
+            object.__setattr__(self, "times", times)
 
     def __len__(self) -> int:
         """Number of rays R."""
@@ -114,10 +124,16 @@ class Scans:
             self.is_return[rays],
             self.target_index[rays],
             select_channels(self.channels, rays),
+            self.times,
         )
 
+    def with_origins(self, scans: Tensor, scan_id: Tensor) -> Scans:
+        """The same rays with the given scans (indices) alone, and their new numbers (R,)."""
+        times = None if self.times is None else self.times[scans]
+        return replace(self, origins=self.origins[scans], scan_id=scan_id, times=times)
+
     def drop_constant_column(self) -> Scans:
-        """The same scans without the last coordinate, which must be constant, such as z of a 2-D log.
+        """The same scans without the last coordinate, which must be constant, such as z of 2-D scans.
 
         Raises:
             ValueError: the last coordinate is not constant.
@@ -133,7 +149,7 @@ class Scans:
 
 
 def concatenate_scans(parts: list[Scans]) -> Scans:
-    """Concatenate the rays of several Scans. Scan numbers are renumbered consecutively.
+    """Concatenate the rays of several Scans. Scans are renumbered consecutively.
 
     Rays of a part without a channel have no value in it.
 
@@ -157,21 +173,30 @@ def concatenate_scans(parts: list[Scans]) -> Scans:
         torch.cat([part.is_return for part in parts]),
         torch.cat([part.target_index for part in parts]),
         concatenate_channels([(part.channels, len(part)) for part in parts]),
+        _concatenate_times(parts),
     )
 
 
+def _concatenate_times(parts: list[Scans]) -> Tensor | None:
+    if all(part.times is None for part in parts):
+        return None
+    unknown = [torch.full_like(part.origins[:, 0], torch.nan) for part in parts]
+    pairs = zip(parts, unknown, strict=True)
+    return torch.cat([none if part.times is None else part.times for part, none in pairs])
+
+
 def every_scan(scans: Scans, step: int) -> Scans:
-    """Every ``step``-th scan, from the first on, numbered anew."""
+    """Every ``step``-th scan, starting with the first. Scans are renumbered."""
     kept = torch.arange(0, scans.num_scans, step, device=scans.ends.device)
     rays = scans.select(scans.scan_id % step == 0)
     scan_id = torch.div(rays.scan_id, step, rounding_mode="floor")
-    return replace(rays, origins=scans.origins[kept], scan_id=scan_id)
+    return rays.with_origins(kept, scan_id)
 
 
 def thin_rays(scans: Scans, voxel: float | None) -> Scans:
-    """The first of all rays of a scan that end in one voxel.
+    """Of the rays of a scan that end in one voxel, keep the first.
 
-    Hits and beams without return are thinned apart. Rays that are not finite are kept: sampling
+    Hits and beams without return are thinned separately. Non-finite rays are kept, because sampling
     counts them.
 
     Args:
@@ -225,10 +250,10 @@ def split_rays(scans: Scans, ratio: float = 0.5, seed: int = 0) -> tuple[Scans, 
 def seeded_generator(
     seed: int, purpose: str, device: torch.device | str = "cpu"
 ) -> torch.Generator:
-    """A generator whose numbers depend on the seed and on what they are for.
+    """A generator whose numbers depend on the seed and on their purpose.
 
-    Sampling, clustering and training with the same seed must not draw the same numbers: points
-    would be placed and chosen by one sequence.
+    Sampling, clustering and training with the same seed must not draw the same numbers, which would
+    be correlated otherwise.
 
     Args:
         seed: any integer.

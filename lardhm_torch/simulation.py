@@ -117,9 +117,9 @@ def simulate_room(
         noise: standard deviation of the Gaussian range noise [m]. The paper writes
             sigma² = N(0, 0.1), which leaves the unit open; 0.02 m is typical of laser scanners.
         seed: random seed of the rotations of the spirals and of the noise.
-        exposure_noise: standard deviation of the logarithm of the exposure of each scanner; half of it
-            applies to the brightness of each ray.
-        wrong_labels: fraction of the rays with the label of a random other class.
+        exposure_noise: standard deviation of the logarithm of the exposure of each scanner; the
+            brightness of each ray has additional noise of half that standard deviation.
+        wrong_labels: fraction of the rays that get the label of a random other class.
 
     Returns:
         Scans with three origins, in the world frame, with the channels "color" and "class" (an index

@@ -1,7 +1,7 @@
 """Incremental mapping of a stream of scans: checkpoints to resume from, and packets to send.
 
-A packet is a packed map, or its differences from the last one (`io.packed_files`). A receiver that
-applies all packets holds exactly the integers of the sender's packed map, and so gives the same answers.
+A packet is a packed map, or its differences from the previous one (`io.packed_files`). A receiver that
+applies all packets has exactly the integers of the sender's packed map, so queries give the same results.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from lardhm_torch.scans import Scans, seeded_generator
 class StreamConfig:
     """Settings of incremental mapping."""
 
-    num_clusters: int | None = (
-        None  # of the first scan, and the most near a later one; None: chosen
-    )
+    # clusters of the first scan, and maximum near each later scan; None: chosen from the data
+    num_clusters: int | None = None
     max_clusters: int | None = None  # upper bound on num_clusters; None: no limit
-    max_rays: int | None = None  # per scan, drawn at random; None: all
+    max_rays: int | None = None  # rays per scan, drawn at random; None: all
     radius: float | None = None  # [m] clusters farther from the sensor are removed; None: keep all
     checkpoint_every: int = 1  # write a checkpoint every N scans
     seed: int = 0  # random seed; scan n uses seed + n
@@ -139,7 +138,7 @@ def stream_scans(
 def resume_stream(path: str | os.PathLike[str]) -> tuple[LardHilbertMap, Progress]:
     """Load the map and the progress of a checkpoint.
 
-    Partial files that an interrupted run left next to the checkpoint are removed.
+    Partial files that an interrupted run left in the folder of the checkpoint are removed.
 
     Args:
         path: checkpoint written by `stream_scans`.
@@ -181,6 +180,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         num_clusters,
         seed=seed,
         channels=samples.channels,
+        time=None if scan.times is None or scan.times.isnan().any() else float(scan.times.max()),
         config=config.update,
     )
     if config.radius is not None:
@@ -219,7 +219,7 @@ def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:
 
 
 class PacketSender:
-    """Makes the packets of a map that changes.
+    """Encodes the changes of a map as packets.
 
     Args:
         precision: fractional bits of the rounded parameters, 1 to 16, see `LardHilbertMap.pack`.
@@ -235,11 +235,11 @@ class PacketSender:
         self._last: packed_files.Packed | None = None
 
     def packet(self, model: LardHilbertMap, *, whole: bool = False) -> bytes:
-        """The next packet: what changed in the map since the last one.
+        """The next packet: the changes of the map since the last one.
 
         Args:
-            model: the map, of any number of clusters.
-            whole: write the whole map, for receivers that missed packets. It is written anyway if the
+            model: the map, with any number of clusters.
+            whole: encode the whole map, for receivers that missed packets. This is always done if the
                 origin or the settings of the map have changed.
         """
         packed = packing.rounded(model, self.precision)
@@ -252,7 +252,7 @@ class PacketSender:
 
 
 class PacketReceiver:
-    """Holds the map of the packets that were applied."""
+    """Decodes packets of a `PacketSender` to a map."""
 
     def __init__(self) -> None:
         self._last: tuple[int, packed_files.Packed] | None = None
@@ -272,7 +272,7 @@ class PacketReceiver:
         self._last = packed_files.decode(packet, self._last)
 
     def map(self) -> LardHilbertMap:
-        """The packed map, which answers but does not learn.
+        """The packed map, for queries only.
 
         Raises:
             RuntimeError: no packet has been applied.
@@ -286,15 +286,15 @@ class PacketWriter:
     """Writes the packets of a map to a file or a folder, for `stream_scans(after_scan=writer.send)`.
 
     Args:
-        path: a folder gets one file per packet; a file, ``.lhm``, gets all packets one after the other.
+        path: a folder, for one file per packet, or an ``.lhm`` file, to which packets are appended.
             `LardHilbertMap.load` reads both.
         precision: fractional bits, see `LardHilbertMap.pack`.
-        resume: continue after the packets that are there. An unfinished packet at the end of a file
-            is removed. Otherwise they are replaced.
+        resume: continue after the existing packets; an unfinished packet at the end of a file is
+            removed. If False, existing packets are replaced.
 
     Raises:
         FileNotFoundError: the folder of path does not exist.
-        ValueError: the packets that are there are damaged, or of another precision.
+        ValueError: the existing packets are damaged, or have another precision.
     """
 
     def __init__(

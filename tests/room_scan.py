@@ -65,3 +65,11 @@ def append_without_pose(file, columns: dict[str, np.ndarray]) -> None:
     writer = vector.writer(buffers)
     writer.write(len(values))
     writer.close()
+
+
+def ptx(points, shape, position, matrix, columns=" 0.5"):
+    """One scan as Leica writes it: the matrix is for row vectors."""
+    rows = [*matrix[:3, :3].T.tolist(), *matrix.T.tolist()]
+    lines = [*map(str, shape), *(" ".join(map(repr, row)) for row in [position.tolist(), *rows])]
+    lines += [" ".join(map(repr, row)) + columns for row in points.tolist()]
+    return "\n".join(lines) + "\n"

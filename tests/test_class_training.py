@@ -95,7 +95,7 @@ def test_wrong_labels_make_the_map_answer_for_the_true_class():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"classes": torch.full((6,), -1)}, "all 6 miss it"),
+        ({"classes": torch.full((6,), -1)}, "all 6 are missing"),
         ({"classes": torch.zeros(5, dtype=torch.long)}, "must have 6 rows"),
         ({"wrong_labels": 0.7}, "below 1/2; got 0.7"),
         ({"num_clusters": 0}, "num_clusters must be"),
@@ -155,5 +155,5 @@ def test_packed_maps_do_not_learn_classes(tmp_path):
     LardHilbertMap(2).fit_classes(points, classes).pack(tmp_path / "map.lhm")
     model = LardHilbertMap.load(tmp_path / "map.lhm")
     for change in (model.fit_classes, model.calibrate_classes):
-        with pytest.raises(ValueError, match="a packed map answers but does not learn"):
+        with pytest.raises(ValueError, match="a packed map supports queries, but no training"):
             change(points, classes)

@@ -152,7 +152,7 @@ def test_a_state_of_another_map_or_config_is_refused():
     model, points, labels = fitted()
     states, config = [], TuneConfig(epochs=1)
     fine_tune(model, points, labels, config=config, after_epoch=states.append)
-    with pytest.raises(ValueError, match="state must be of this config"):
+    with pytest.raises(ValueError, match="state must belong to this config"):
         fine_tune(model, points, labels, state=states[0])
     other = LardHilbertMap(2).fit(points, labels, num_clusters=10)
     with pytest.raises(ValueError, match="state must be of a map with 10 clusters; got 24"):
@@ -202,6 +202,7 @@ def test_what_cannot_be_tuned_is_refused():
         ({"stiffness": -1.0}, "l2 and stiffness must be 0 or more"),
         ({"occupied_share": 1.0}, r"occupied_share must be in \(0, 1\); got 1.0"),
         ({"patience": 2}, "patience needs held-out rays; got hold_out = 0.0"),
+        ({"unknown_share": -0.1}, "unknown_share must be 0 or more; got -0.1"),
         ({"hold_out": 1.0}, "hold_out must be at least 0 and below 1; got 1"),
     ],
 )
@@ -210,16 +211,17 @@ def test_settings_are_checked_when_made(settings, message):
         TuneConfig(**settings)
 
 
-def test_unknown_points_do_not_train():
+def test_unknown_points_do_not_train_without_a_share_of_the_loss():
     model, points, labels = fitted(num_clusters=8, config=FitConfig(passes=4))
     other, rays = copy.deepcopy(model), torch.arange(len(points))
     fine_tune(model, points, labels, ray_id=rays)
-    more = torch.cat([points, points[:50] + 0.3])
+    more, config = torch.cat([points, points[:50] + 0.3]), TuneConfig(unknown_share=0)
     fine_tune(
         other,
         more,
         torch.cat([labels, torch.full((50,), 0.5)]),
         ray_id=torch.cat([rays, rays[:50]]),
+        config=config,
     )
     assert torch.equal(model.weights, other.weights)
     with pytest.raises(ValueError, match="all are 1/2"):

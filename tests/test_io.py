@@ -39,7 +39,7 @@ def test_named_columns_give_scan_return_and_target(tmp_path):
 def test_a_file_without_sensor_position_takes_the_one_that_is_given(tmp_path, name):
     path = write_by_hand(tmp_path, name, some_points())
     assert load_scans(path, origin=(1, 2, 3)).origins.tolist() == [[1, 2, 3]]
-    with pytest.raises(ValueError, match=r"where the sensor stood.*origin=\(x, y, z\).*--origin"):
+    with pytest.raises(ValueError, match=r"the sensor position.*origin=\(x, y, z\).*--origin"):
         load_scans(path)
     with pytest.raises(ValueError, match=r"origin must be \(3,\).*got \(1, 2\)"):
         load_scans(path, origin=(1, 2))

@@ -142,7 +142,7 @@ def test_a_bag_and_its_conversion_in_one_folder_are_not_read_twice(tmp_path):
 def test_fewer_messages_than_metadata_promises_are_reported(tmp_path):
     names = [f"bag_{number}.mcap" for number in range(3)]
     bag = write_parts(tmp_path / "bag", metadata=metadata_of(names, 9))
-    with pytest.warns(ScanFileWarning, match="6 messages, but metadata.yaml promises 9"):
+    with pytest.warns(ScanFileWarning, match="6 messages, but metadata.yaml declares 9"):
         assert_rays(load_scans(bag), DRIVE)
 
 

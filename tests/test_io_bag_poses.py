@@ -40,7 +40,7 @@ def test_rays_of_registered_clouds_start_at_the_sensor(tmp_path, name, fixed):
     report = ScanReport()
     path = write_bag(tmp_path / name, lambda maker: registered(maker, fixed))
     assert_rays(load_scans(path, report=report), DRIVE, 2e-6)
-    assert f"clouds are in {fixed}; sensor taken to be at lidar (guess: sensor_frame=" in str(
+    assert f"clouds are in {fixed}; sensor assumed to be at lidar (guess: sensor_frame=" in str(
         report
     )
     with pytest.raises(ValueError, match="strict reading refuses a guess: clouds are in"):
@@ -104,9 +104,9 @@ def test_registered_clouds_are_seen_from_the_mount_on_poses_without_a_frame(tmp_
         ScanReport(),
     )
     assert_rays(load_scans(path, report=report), DRIVE, 2e-6)
-    assert "sensor taken to be at lidar (guess:" in str(report)
+    assert "sensor assumed to be at lidar (guess:" in str(report)
     path = write_bag(tmp_path / f"b{name}", lambda maker: messages(maker, ["lidar", "imu"]))
-    with pytest.warns(ScanFileWarning, match="sensor at the poses of /pose .*poses_frame says of"):
+    with pytest.warns(ScanFileWarning, match="sensor at the poses of /pose .*poses_frame names"):
         load_scans(path)
     scans = load_scans(path, poses_frame="base", sensor_frame="lidar", strict=True)
     assert_rays(scans, DRIVE, 2e-6)
@@ -119,9 +119,7 @@ def test_registered_clouds_without_any_pose_of_the_sensor_are_refused(tmp_path):
             yield maker.cloud(scan, 10.0 + number, frame="odom")
 
     path = write_bag(tmp_path / "a.db3", messages)
-    with pytest.raises(
-        ValueError, match=r"in odom, a fixed frame: where the sensor stood must come"
-    ):
+    with pytest.raises(ValueError, match=r"in odom, a fixed frame: the sensor position must come"):
         load_scans(path)
     assert load_scans(path, sensor_frame="odom").num_scans == 3
 
@@ -143,7 +141,9 @@ def test_clouds_moved_to_the_robots_base_are_seen_from_the_sensor_on_it(tmp_path
     assert_rays(load_scans(path), DRIVE, 2e-6)
     path = write_bag(tmp_path / "b.mcap", lambda maker: messages(maker, ["lidar", "imu"]))
     assert_rays(load_scans(path, sensor_frame="lidar", strict=True), DRIVE, 2e-6)
-    with pytest.warns(ScanFileWarning, match="taken to be at the origin of base_link .*imu, lidar"):
+    with pytest.warns(
+        ScanFileWarning, match="assumed to be at the origin of base_link .*imu, lidar"
+    ):
         scans = load_scans(path)
     np.testing.assert_allclose(scans.origins, DRIVE.of_base[:, :3, 3], atol=1e-9)
 
@@ -162,7 +162,7 @@ def test_a_mount_counts_where_poses_do_not_say_their_frame(tmp_path, name, kind)
 
     path, report = write_bag(tmp_path / name, messages), ScanReport()
     assert_rays(load_scans(path, report=report), DRIVE)
-    assert "does not say of which frame its poses are: taken to be base's (guess:" in str(report)
+    assert "does not name the frame of its poses: assumed to be base (guess:" in str(report)
     assert_rays(load_scans(path, poses_frame="base", strict=True), DRIVE)
     without = load_scans(path, poses_frame="lidar", strict=True)
     np.testing.assert_allclose(without.origins, DRIVE.of_base[:, :3, 3], atol=1e-9)

@@ -150,7 +150,7 @@ def test_a_livox_cloud_that_is_cut_short_is_an_error(tmp_path, cut):
         write_bag(tmp_path / f"{is_ros1}{'.bag' if is_ros1 else '.mcap'}", messages)
         kind = "livox_ros_driver2/CustomMsg"
         message = Message("/l", kind, 0, memoryview(content[0])[:-cut], is_ros1)
-        with pytest.raises(ValueError, match=r"promises 40 points; got|ends before its header"):
+        with pytest.raises(ValueError, match=r"declares 40 points; got|ends before its header"):
             read_cloud(message, None)
 
 

@@ -69,6 +69,7 @@ def test_tf_places_the_clouds_by_all_frames_up_to_the_root(tmp_path, name):
     scans = load_scans(write_bag(tmp_path / name, messages))
     assert np.allclose(scans.ends, np.tile(points, (3, 1)), atol=1e-5)
     assert np.allclose(scans.origins, (MOUNT @ poses @ MOUNT)[:, :3, 3])
+    assert scans.times.tolist() == [10, 11, 12]
 
 
 @pytest.mark.parametrize("name", ONE_OF_EACH)
@@ -256,9 +257,9 @@ def test_fields_of_a_cloud_are_found_by_their_offsets(tmp_path, big_endian):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("width", 201, "promises 1 x 201 points of 16 bytes; got 3200 bytes"),
-        ("height", 2**31, "promises 2147483648 x 200 points"),
-        ("point_step", 11, "promises 1 x 200 points of 11 bytes"),
+        ("width", 201, "declares 1 x 201 points of 16 bytes; got 3200 bytes"),
+        ("height", 2**31, "declares 2147483648 x 200 points"),
+        ("point_step", 11, "declares 1 x 200 points of 11 bytes"),
         ("row_step", 2**32 - 1, None),  # of no matter where there is one row
         ("width", 0, "at least one point is needed"),
         ("fields", [], "needs the fields x, y, z; got none"),
@@ -325,11 +326,11 @@ def test_recordings_that_were_not_closed_say_how_to_mend_them(tmp_path):
 def test_a_small_chunk_that_unpacks_to_gigabytes_is_refused_before():
     zeros = bz2.compress(bytes(1 << 26))
     unpack = Unpacker(file_size=1000)
-    with pytest.raises(ValueError, match="promises 4294967295 bytes, more than the file can hold"):
+    with pytest.raises(ValueError, match="declares 4294967295 bytes, more than the file can hold"):
         unpack(memoryview(zeros), "bz2", 2**32 - 1)
-    with pytest.raises(ValueError, match="promises 1000 bytes; got 1001 or more"):
+    with pytest.raises(ValueError, match="declares 1000 bytes; got 1001 or more"):
         unpack(memoryview(zeros), "bz2", 1000)
-    with pytest.raises(ValueError, match="promises None bytes; got 16977217 or more"):
+    with pytest.raises(ValueError, match="declares None bytes; got 16977217 or more"):
         unpack(memoryview(zeros), "bz2", None)
 
 

@@ -98,7 +98,7 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path, name):
             "a.ply",
             "ply\nformat binary_little_endian 1.0\nelement strip 1\nproperty list uchar int i\n"
             "element vertex 1\nproperty float x\nproperty float y\nend_header\n",
-            "1 records are promised; got 0 bytes",
+            "1 records are declared; got 0 bytes",
         ),
         ("a.pcd", "FIELDS x y\nSIZE 4\nTYPE F F\nDATA ascii\n", "one entry per field; got 2, 1"),
         ("a.pcd", "FIELDS x\nSIZE 3\nTYPE F\nDATA ascii\n", "field x has TYPE F and SIZE 3"),

@@ -81,7 +81,7 @@ def test_spherical_points_are_turned_into_cartesian_ones(tmp_path):
     angles = np.arctan2(points[:, 1], points[:, 0]), np.arcsin(points[:, 2] / ranges)
     write_spherical(tmp_path / "a.e57", np.stack([ranges, *angles], axis=1))
     assert np.allclose(load_points(tmp_path / "a.e57"), points, rtol=0, atol=1e-12)
-    with pytest.raises(ValueError, match="must say where the sensor stood"):
+    with pytest.raises(ValueError, match="must contain the sensor position"):
         load_scans(tmp_path / "a.e57")
 
 
@@ -120,7 +120,7 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path):
     path = write_e57(tmp_path / "a.e57", [some_points()], np.eye(4)[None])
     old, new = b'recordCount="200">\n        <', b'recordCount="9999999999">\n <'
     set_xml(path, old, new)
-    with pytest.raises(ValueError, match=r"9999999999 points are promised; .* bytes are too few"):
+    with pytest.raises(ValueError, match=r"9999999999 points are declared; .* bytes are too few"):
         load_points(path)
 
 

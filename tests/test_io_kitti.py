@@ -68,7 +68,9 @@ def test_without_poses_a_kitti_scan_is_taken_as_it_is_from_a_given_origin(tmp_pa
     points = some_points().astype(np.float32)
     write_kitti(tmp_path, ["0"], points, np.eye(4)[None])
     assert np.array_equal(load_scans(tmp_path, origin=(0, 0, 0)).ends, points)
-    with pytest.raises(ValueError, match=r"0\.bin must say where.*Put its poses\.txt beside it"):
+    with pytest.raises(
+        ValueError, match=r"0\.bin must contain the sensor position.*Put its poses\.txt beside it"
+    ):
         load_scans(tmp_path)
 
 

@@ -60,12 +60,12 @@ def test_a_laz_must_hold_the_points_it_promises(tmp_path, count):
     content = bytearray(path.read_bytes())
     content[247:255] = count.to_bytes(8, "little")
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{count} points are promised.*the chunks hold 200"):
+    with pytest.raises(ValueError, match=rf"{count} points are declared.*the chunks hold 200"):
         load_points(path)
 
 
 @needs_laspy
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
 def test_a_las_without_points_is_an_error(tmp_path, name):
-    with pytest.raises(ValueError, match="0 points are promised, one is needed"):
+    with pytest.raises(ValueError, match="0 points are declared, one is needed"):
         load_points(write_las(tmp_path / name, np.zeros((0, 3))))

@@ -163,5 +163,5 @@ def test_an_npz_that_promises_far_more_than_it_holds_is_refused(tmp_path, at):
     for field in at:
         content[entry + field : entry + field + 4] = (2**32 - 2).to_bytes(4, "little")
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"points promises 4294967294 bytes; \d+ cannot hold them"):
+    with pytest.raises(ValueError, match=r"points declares 4294967294 bytes; \d+ cannot hold them"):
         load_points(path)

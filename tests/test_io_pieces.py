@@ -89,7 +89,7 @@ def test_what_is_wrong_with_a_file_is_said_as_when_it_is_loaded(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, points=some_points())
     for read in (load_scans, lambda p: list(iter_pieces(p))):
-        with pytest.raises(ValueError, match=r"a\.npz must say where the sensor stood"):
+        with pytest.raises(ValueError, match=r"a\.npz must contain the sensor position"):
             read(path)
     np.savez(path, points=some_points(), origins=np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"a\.npz cannot be read: scan_id is needed to choose"):

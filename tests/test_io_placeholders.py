@@ -57,7 +57,7 @@ def every_reader(path, **options):
 )
 def test_an_identity_viewpoint_far_from_the_points_is_no_sensor_position(tmp_path, viewpoint):
     write_pcd(tmp_path / "a.pcd", world_points() + FAR, viewpoint)
-    message = r"a\.pcd must say where the sensor stood.*points are \d+ m and more.*--origin"
+    message = r"a\.pcd must contain the sensor position.*points are \d+ m and more.*--origin"
     for read in (
         load_scans,
         lambda path: list(iter_scans(path)),
@@ -75,7 +75,9 @@ def test_a_single_scan_near_its_identity_viewpoint_is_read_and_the_guess_is_repo
     report = ScanReport()
     scans = load_scans(tmp_path / "a.pcd", report=report)
     assert scans.origins.tolist() == [[0, 0, 0]]
-    assert "identity pose taken for a sensor at zero (guess: --origin 0,0,0" in str(report)
+    assert "identity pose assumed to be that of a sensor at zero (guess: --origin 0,0,0" in str(
+        report
+    )
     with pytest.raises(ValueError, match=r"a\.pcd: strict reading refuses a guess.*--origin 0,0,0"):
         load_scans(tmp_path / "a.pcd", strict=True)
     assert len(load_scans(tmp_path / "a.pcd", origin=(0, 0, 0), strict=True)) == len(scans)
@@ -90,7 +92,7 @@ def test_several_scans_with_an_identity_viewpoint_prove_that_it_is_none(tmp_path
         lambda path: next(iter_pieces(path)),
     ):
         with pytest.raises(
-            ValueError, match=r"a\.pcd must say where the sensor stood.*\d scans have it"
+            ValueError, match=r"a\.pcd must contain the sensor position.*\d scans have it"
         ):
             read(tmp_path)
     assert every_reader(tmp_path, origin=(0, 0, 0)) == [720, 720, 720]
@@ -119,7 +121,7 @@ def test_a_pose_file_beside_an_identity_viewpoint_must_be_used(tmp_path):
 def test_a_viewpoint_that_rotates_asks_for_the_frame(tmp_path):
     half = 0.5**0.5
     write_pcd(tmp_path / "a.pcd", sensor_points(), f"1.5 -0.75 1.25 {half} 0 0 {half}")
-    with pytest.raises(ValueError, match=r'a\.pcd .*rotates.*frame="sensor".*--frame'):
+    with pytest.raises(ValueError, match=r'a\.pcd .*has a rotation.*frame="sensor".*--frame'):
         load_scans(tmp_path / "a.pcd")
     scans = load_scans(tmp_path / "a.pcd", frame="sensor")
     np.testing.assert_allclose(scans.ends, world_points(), rtol=0, atol=1e-12)
@@ -143,7 +145,7 @@ def test_identity_poses_of_an_e57_far_away_are_placeholders(tmp_path, pose_given
     rotations = None if pose_given == "translation" else [[1.0, 0, 0, 0]]
     translations = None if pose_given == "rotation" else [np.zeros(3)]
     write_e57(tmp_path / "a.e57", [world_points() + FAR], rotations, translations)
-    with pytest.raises(ValueError, match=r"a\.e57 must say where the sensor stood.*--origin"):
+    with pytest.raises(ValueError, match=r"a\.e57 must contain the sensor position.*--origin"):
         load_scans(tmp_path / "a.e57")
     assert load_scans(tmp_path / "a.e57", origin=FAR).origins.tolist() == [FAR.tolist()]
 
@@ -176,7 +178,9 @@ def test_an_identity_pose_among_others_is_one_of_the_first_scan_near_zero(
         path.write_text("".join(map(ptx, scans, poses)))
     if wrong:
         count = f"{len(wrong)} of {len(shifts)} scans, the first of them {wrong[0]}"
-        with pytest.raises(ValueError, match=rf"a\.{suffix} must say where.*for {count}"):
+        with pytest.raises(
+            ValueError, match=rf"a\.{suffix} must contain the sensor position.*for {count}"
+        ):
             load_scans(path)
     report = ScanReport()
     read = load_scans(path, origin=(max(shifts), 2, 3) if wrong else None, report=report)
@@ -184,7 +188,7 @@ def test_an_identity_pose_among_others_is_one_of_the_first_scan_near_zero(
     assert read.origins[:, 0].tolist() == expected.tolist()
     ends = np.concatenate([sensor_points() + place * ahead for place in places])
     np.testing.assert_allclose(read.ends, ends, rtol=0, atol=1e-4)
-    assert ("is taken for its own (guess" in str(report)) == (not wrong)
+    assert ("is assumed to be valid (guess" in str(report)) == (not wrong)
 
 
 @pytest.mark.parametrize("missing", [0, 1])
@@ -340,5 +344,5 @@ def test_a_pose_file_beside_an_e57_without_a_pose_is_used_when_the_frame_is_said
 
 def test_a_frame_is_refused_for_an_e57_with_poses(tmp_path):
     write_e57(tmp_path / "a.e57", [sensor_points()], None, [POSITION])
-    with pytest.raises(ValueError, match=r"a\.e57.*other formats say it themselves"):
+    with pytest.raises(ValueError, match=r"a\.e57.*other formats state their frame"):
         load_scans(tmp_path / "a.e57", frame="sensor")

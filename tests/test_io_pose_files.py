@@ -73,7 +73,7 @@ def test_poses_of_the_camera_are_moved_to_the_lidar_by_calib(tmp_path, ending, c
     (tmp_path / "calib.txt").write_text(CALIBS[calib])
     report = ScanReport()
     assert_rays(load_scans(tmp_path / "velodyne", report=report, **how), from_first())
-    assert "poses taken to be the camera's, as KITTI publishes them" in str(report)
+    assert "poses assumed to be the camera's, as KITTI publishes them" in str(report)
     given = load_scans(tmp_path / "velodyne", poses_frame="camera", strict=True, **how)
     assert_rays(given, from_first())
 
@@ -95,7 +95,7 @@ def test_poses_of_the_lidar_beside_a_complete_calib_must_be_said_to_be_so(tmp_pa
     assert_rays(load_scans(tmp_path, poses_frame="lidar", strict=True, **how), DRIVE)
     assert abs(load_scans(tmp_path, **how).ends.numpy() - DRIVE.ends).max() > 0.1
     with pytest.raises(
-        ValueError, match="strict reading refuses a guess: poses taken to be the cam"
+        ValueError, match="strict reading refuses a guess: poses assumed to be the cam"
     ):
         load_scans(tmp_path, strict=True, **how)
 
@@ -119,7 +119,7 @@ def test_a_camera_that_looks_ahead_warns_where_there_is_no_calib(tmp_path):
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 2, 3] = 0, 4, 8
     write_poses(tmp_path / "poses.txt", poses)
-    with pytest.warns(ScanFileWarning, match="poses taken to be the lidar's .*uses Tr of calib"):
+    with pytest.warns(ScanFileWarning, match="poses assumed to be the lidar's .*uses Tr of calib"):
         load_scans(tmp_path)
 
 

@@ -142,10 +142,10 @@ def test_a_frame_without_a_pose_or_of_a_format_that_says_it_is_an_error(tmp_path
     path = write_by_hand(tmp_path, "ply-little", some_points())
     with pytest.raises(ValueError, match=r'frame="sensor" needs a pose .* poses\.txt'):
         load_scans(path, frame="sensor")
-    with pytest.raises(ValueError, match="must say where the sensor stood"):
+    with pytest.raises(ValueError, match="must contain the sensor position"):
         load_scans(path, frame="world")
     write_kitti(tmp_path / "kitti", ["0"], some_points(), np.eye(4)[None])
-    with pytest.raises(ValueError, match=r'frame="world" is for \.ply .*say it themselves'):
+    with pytest.raises(ValueError, match=r'frame="world" is for \.ply .*state their frame'):
         load_scans(tmp_path / "kitti", origin=(0, 0, 0), frame="world")
     with pytest.raises(ValueError, match=r'frame must be "sensor", "world" or None; got \'map\''):
         load_scans(path, frame="map")

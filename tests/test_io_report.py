@@ -212,7 +212,7 @@ def test_thinning_keeps_rays_that_are_not_finite_and_needs_a_size():
 
 
 def test_every_is_refused_where_files_are_read_in_pieces():
-    with pytest.raises(ValueError, match="--every is not for tiled maps"):
+    with pytest.raises(ValueError, match="--every cannot be used with tiled maps"):
         next(iter_pieces_of(argparse.Namespace(every=2)))
 
 

@@ -54,6 +54,9 @@ def test_the_same_images_in_the_tum_layout_give_the_same_scans(frames, tmp_path)
     # The stored matrices are no exact rotations (2e-4 off), and a quaternion is one.
     assert np.allclose(ours.ends, theirs.ends, rtol=0, atol=1e-3)
     assert np.allclose(ours.origins, theirs.origins, rtol=0, atol=1e-9)
+    assert np.allclose(ours.times.diff(), 1, rtol=0, atol=1e-5)
+    assert ours.times[0] == 1305031102.160407
+    assert theirs.times is None
 
 
 def test_a_pixel_is_where_the_pinhole_says(tmp_path):

@@ -128,7 +128,7 @@ def test_a_temporary_folder_that_another_user_laid_out_is_not_used(home, tmp_pat
 def test_without_any_private_folder_there_is_no_kernel(home, tmp_path):
     home.parent.write_text("not a folder")
     (tmp_path / "temporary").chmod(0o777)
-    with pytest.raises(OSError, match=r"no folder for the compiled kernel.*LARDHM_CACHE"):
+    with pytest.raises(OSError, match=r"no folder for the compiled library.*LARDHM_CACHE"):
         cache.cached_file("kernel.so", write_kernel)
 
 

@@ -37,7 +37,9 @@ class Bomb:
 def test_a_pickle_bomb_is_refused_and_does_not_go_off(path, tmp_path):
     for write in (torch.save, lambda state, p: p.write_bytes(pickle.dumps(state))):
         write({"weights": Bomb(tmp_path / "boom")}, path)
-        with pytest.raises(ValueError, match=r"map\.pt must be a map file, whole and safe to load"):
+        with pytest.raises(
+            ValueError, match=r"map\.pt must be a complete map file that is safe to load"
+        ):
             LardHilbertMap.load(path)
         assert not (tmp_path / "boom").exists()
 
@@ -47,7 +49,7 @@ def test_a_file_cut_short_anywhere_is_refused(path):
     whole = path.read_bytes()
     for cut in (0, 1, 10, 100, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:cut])
-        with pytest.raises(ValueError, match=r"map\.pt must be a map file"):
+        with pytest.raises(ValueError, match=r"map\.pt must be a complete map file"):
             LardHilbertMap.load(path)
 
 
@@ -158,7 +160,7 @@ def test_safetensors_cut_short_anywhere_are_refused(safe_path):
     whole = safe_path.read_bytes()
     for cut in (0, 1, 8, 100, len(whole) // 2, len(whole) - 1):
         safe_path.write_bytes(whole[:cut])
-        with pytest.raises(ValueError, match=r"map\.safetensors must be a map file"):
+        with pytest.raises(ValueError, match=r"map\.safetensors must be a complete map file"):
             LardHilbertMap.load(safe_path)
 
 

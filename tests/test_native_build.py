@@ -47,7 +47,7 @@ def ask_in_process(**environment: str) -> str:
 def test_without_a_compiler_one_warning_names_the_cause_and_the_cure(tmp_path):
     answer = ask_in_process(CXX="no-such-compiler", LARDHM_CACHE=str(tmp_path), LARDHM_NATIVE="1")
     assert answer.startswith("False 1 ")
-    assert f"no compiled kernel is installed for {platform.system()} on" in answer
+    assert f"no compiled library is installed for {platform.system()} on" in answer
     assert "no-such-compiler" in answer
     assert "LARDHM_NATIVE=0" in answer
 

@@ -75,7 +75,7 @@ def test_a_library_that_does_not_load_is_replaced_by_a_compiled_one(wheel, monke
 def test_without_a_compiler_the_warning_says_why_the_shipped_one_does_not_load(wheel, monkeypatch):
     monkeypatch.setenv("LARDHM_NATIVE", "1")
     monkeypatch.setenv("CXX", "no-such-compiler")
-    with pytest.warns(UserWarning, match=r"installed kernel does not load \(.*no-such-compiler"):
+    with pytest.warns(UserWarning, match=r"installed library does not load \(.*no-such-compiler"):
         assert not build._try_to_load()
 
 

@@ -66,11 +66,11 @@ def test_damaged_packed_channels_are_found(tmp_path):
     content = path.read_bytes()
     for place in (8, 13, 17, 30, 200, len(content) // 3):
         path.write_bytes(content[:place] + bytes([content[place] ^ 64]) + content[place + 1 :])
-        with pytest.raises(ValueError, match=r"map\.lhm must be a packed map, whole"):
+        with pytest.raises(ValueError, match=r"map\.lhm must be a complete packed map"):
             LardHilbertMap.load(path)
     for length in (8, 20, 300, len(content) - 1):
         path.write_bytes(content[:length])
-        with pytest.raises(ValueError, match=r"map\.lhm must be a packed map, whole"):
+        with pytest.raises(ValueError, match=r"map\.lhm must be a complete packed map"):
             LardHilbertMap.load(path)
     other = LardHilbertMap(3).double().fit(*wall(), 20)
     block = content[: -len(encode(rounded(model)))]

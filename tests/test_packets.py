@@ -187,7 +187,7 @@ def test_the_command_line_sends_packs_and_queries(folder, name, capsys):
     assert main(["info", str(sent)]) == 0
     assert "training points       unknown" in capsys.readouterr().out
     assert main(["update", str(packed), str(folder / "scans"), "-o", str(map_file)]) == 1
-    assert "a packed map answers but does not learn" in capsys.readouterr().err
+    assert "a packed map supports queries, but no training" in capsys.readouterr().err
 
 
 def test_a_resumed_fit_sends_on(folder):

@@ -115,7 +115,7 @@ def test_a_packed_map_does_not_learn_and_says_why(path, tmp_path):
             lambda one=one: merge_maps(one, wall_map()),
             lambda one=one: merge_maps(wall_map(), one),
         ):
-            with pytest.raises(ValueError, match="a packed map answers but does not learn"):
+            with pytest.raises(ValueError, match="a packed map supports queries, but no training"):
                 learn()
     assert all(torch.equal(before[name], tensor) for name, tensor in model.state_tensors())
 
@@ -225,7 +225,7 @@ def with_table(table, path):
 
 
 @pytest.mark.parametrize(
-    ("column", "value", "message"), [(0, 3, "kinds"), (2, 2**29, "length-scales")]
+    ("column", "value", "message"), [(0, 3, "kinds"), (2, 2**29, "length scales")]
 )
 def test_crafted_clusters_are_refused(path, column, value, message):
     whole_packet(path)
@@ -241,7 +241,7 @@ def test_rows_that_inflate_to_something_else_are_refused(path):
     for body in (b"", b"no zlib", zlib.compress(bytes(10**6)), zlib.compress(b"") + b"more"):
         head = content[:16] + struct.pack("<I", len(body)) + content[20:84]
         path.write_bytes(resealed(head + body))
-        with pytest.raises(ValueError, match=r"map\.lhm must be a packed map, whole; "):
+        with pytest.raises(ValueError, match=r"map\.lhm must be a complete packed map; "):
             LardHilbertMap.load(path)
 
 

@@ -81,7 +81,7 @@ def test_points_without_a_place_are_dropped():
 def test_a_cloud_that_is_too_short_is_refused():
     cloud = cloud_of(np.ones((4, 3)))
     cloud.data = cloud.data[:-1]
-    with pytest.raises(ValueError, match="promises 1 x 4 points"):
+    with pytest.raises(ValueError, match="declares 1 x 4 points"):
         ros2_node.points_of(cloud)
 
 

@@ -153,8 +153,11 @@ def test_other_files_are_not_taken_for_a_manifest(tmp_path):
     with pytest.raises(FileNotFoundError, match="must be the folder of a tiled map"):
         read_manifest(tmp_path)
     for text, message in [
-        ("", "manifest.json must be the manifest of a tiled map; it must be JSON"),
-        ("[" * 100_000, "manifest.json must be the manifest of a tiled map; it must be JSON"),
+        ("", "manifest.json must be the manifest of a tiled map; it must be complete JSON"),
+        (
+            "[" * 100_000,
+            "manifest.json must be the manifest of a tiled map; it must be complete JSON",
+        ),
         ("[]", "format_version must be 3; got None"),
         ('{"format_version": 4}', "got 4. A newer folder needs a newer lardhm_torch"),
         ('{"format_version": 2}', "got 2. .*an older one must be tiled and fitted again"),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lardhm_torch import LardHilbertMap, Scans, sample_rays
+from lardhm_torch import LardHilbertMap, Scans, TuneConfig, fine_tune, sample_rays
 from lardhm_torch.features import neighbor_fade
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.unseen import draw_tails, off_surfaces
@@ -159,3 +159,18 @@ def test_a_neighbor_has_faded_out_when_another_takes_its_place():
     assert fade[1].tolist() == [0, 1]
     everyone = torch.tensor([[0, 1, 2]])
     assert (neighbor_fade(here[:1], centers, everyone) == 1).all()
+
+
+def test_tuning_keeps_unseen_space_unknown():
+    samples = sample_rays(facing_wall(), seed=0)
+    rng = torch.Generator().manual_seed(5)
+    unseen = 6 * torch.rand(4000, 3, generator=rng, dtype=F64) - 3
+    unseen[:, 0] += 6.3  # from 0.3 m behind the wall
+    shares = []
+    for share in (0.1, 0.0):
+        model = LardHilbertMap().fit(samples.points, samples.labels)
+        config = TuneConfig(unknown_share=share)
+        fine_tune(model, samples.points, samples.labels, ray_id=samples.ray_id, config=config)
+        shares.append(float((model.log_odds(unseen).abs() > 1).double().mean()))
+    assert shares[0] < 0.01
+    assert shares[0] < 0.3 * shares[1]

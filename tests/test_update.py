@@ -14,6 +14,7 @@ from lardhm_torch import (
     native,
     resize_optimizer,
     sample_rays,
+    simulate_room,
     split_rays,
 )
 from lardhm_torch.learning import parameters
@@ -420,6 +421,16 @@ def test_revisits_make_hardly_more_clusters_than_all_rays_at_once(data, name):
     samples = sample_rays(scans.select(order))
     whole = LardHilbertMap().fit(samples.points, samples.labels)
     assert len(model) <= 1.5 * len(whole)
+
+
+def test_a_robot_that_waits_gets_no_more_clusters():
+    scans, model, sizes = simulate_room(num_rays=1000, seed=3), LardHilbertMap(), []
+    for seed in range(20):  # other free points along the same rays
+        samples = sample_rays(scans, seed=seed)
+        model.update(samples.points, samples.labels, seed=seed)
+        sizes.append(len(model))
+    assert sizes[-1] <= 1.05 * sizes[9]
+    assert sizes[-1] <= 1.3 * sizes[0]
 
 
 def test_scans_that_each_see_a_little_more_make_finer_clusters():

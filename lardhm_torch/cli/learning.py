@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lardhm_torch.cli.forgetting import check_not_at_once, set_max_age
 from lardhm_torch.cli.map_size import check_not_incremental, fit_settings
 from lardhm_torch.cli.outputs import MAP_SUFFIXES, SCAN_OUTPUTS, check_output
 from lardhm_torch.cli.scan_files import (
@@ -78,8 +79,9 @@ def fit(arguments: argparse.Namespace) -> None:
 def _fit_at_once(arguments: argparse.Namespace) -> None:
     from lardhm_torch import sample_rays
 
-    if arguments.resume or arguments.view or arguments.radius is not None:
-        raise ValueError("--resume, --view and --radius need --incremental")
+    if arguments.resume or arguments.view:
+        raise ValueError("--resume and --view need --incremental")
+    check_not_at_once(arguments)
     if arguments.send is not None or arguments.precision is not None:
         raise ValueError(
             "--send and --precision need --incremental; `lardhm pack` packs a finished map"
@@ -140,7 +142,7 @@ def _tune(
     state: dict[str, Any] | None,
     arguments: argparse.Namespace,
 ) -> None:
-    """Fine-tune with free points sampled anew in every epoch."""
+    """Fine-tune with free points sampled again in every epoch."""
     from lardhm_torch import fine_tune, sample_rays
     from lardhm_torch.io.map_files import save_state
 
@@ -183,6 +185,7 @@ def _fit_incrementally(arguments: argparse.Namespace) -> None:
             raise ValueError("SCANS must hold at least one ray; got none")
         scans, done = itertools.chain([first], scans), None
         model = _new_map(first.dim, arguments)
+    set_max_age(model, arguments)
     send = _packet_writer(arguments)
     with _live_view(arguments.view) as show, ExitStack() as stack:
         watchers = [watch for watch in (send, show) if watch is not None]
@@ -262,11 +265,14 @@ def update(arguments: argparse.Namespace) -> None:
         update_folder(arguments)
         return
     if arguments.output is None:
-        raise ValueError("--output is required for a map file; only a tiled map needs none")
+        raise ValueError(
+            "--output is required for a map file; only a tiled map is updated in place"
+        )
     check_output(arguments.output, MAP_SUFFIXES, arguments.scans)
     from lardhm_torch import LardHilbertMap, StreamConfig, stream_scans
 
     model = LardHilbertMap.load(arguments.map)
+    set_max_age(model, arguments)
     config = StreamConfig(
         num_clusters=arguments.clusters,
         radius=arguments.radius,

@@ -1,4 +1,4 @@
-"""Arguments of the command line that say how many clusters a fitted map gets."""
+"""Arguments of the command line for the number of clusters of a map."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def add_map_size(sub: argparse.ArgumentParser) -> None:
         "--size",
         type=size_in_bytes,
         metavar="SIZE",
-        help="as many clusters as fit into a file of this size when the map is packed, such as 20kB",
+        help="choose as many clusters as fit into a packed map of this size, such as 20kB",
     )
     sub.add_argument(
         "--small",
         action="store_true",
-        help="about a third of the clusters, as many as the scene needs, with trained shapes: as good "
-        "at points, less exact in ranges and meshes",
+        help="choose only as many clusters as the scene needs, about a third of the default, and train "
+        "their shapes: probabilities are as accurate, ranges and meshes are less exact",
     )
 
 
@@ -51,9 +51,7 @@ def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
     is_tuned = bool(arguments.tune or arguments.tune_state)
     if is_tuned and (arguments.size is not None or arguments.small):
-        raise ValueError(
-            "--size and --small cannot be used with --tune, which trains shapes itself"
-        )
+        raise ValueError("--size and --small cannot be used with --tune, which also trains shapes")
     if arguments.small and arguments.clusters is not None:
         raise ValueError("--small cannot be used with --clusters; it chooses the number")
     settings: dict[str, Any] = {"num_clusters": arguments.clusters, "max_bytes": arguments.size}
@@ -63,6 +61,6 @@ def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def check_not_incremental(arguments: argparse.Namespace) -> None:
-    """Raise a ValueError if an argument is given that a fit of single scans does not have."""
+    """Raise a ValueError for arguments that an incremental fit does not support."""
     if arguments.size is not None or arguments.small:
         raise ValueError("--size and --small cannot be used with --incremental")

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from lardhm_torch.cli import learning, queries, tiling
+from lardhm_torch.cli.forgetting import add_forgetting
 from lardhm_torch.cli.map_size import add_map_size
 from lardhm_torch.cli.scan_arguments import add_ranges, add_reading, add_scans, finite
 
@@ -59,7 +60,7 @@ def _scan_verbs(verb: Any) -> None:
         type=float,
         default=0.0,
         metavar="F",
-        help="fraction of rays with the label of another class (default: 0)",
+        help="fraction of rays that get the label of another class (default: 0)",
     )
     _seed(sub)
 
@@ -92,13 +93,12 @@ def _fit(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--uncertainty",
         action="store_true",
-        help="also store the variance of the weights, for colors by variance",
+        help="also store the variance of the weights, which is required to color by variance",
     )
     sub.add_argument(
         "--tune-state",
         metavar="FILE",
-        help="fine-tune, write a checkpoint to FILE after every epoch, and resume from it if it "
-        "exists",
+        help="fine-tune, writing a checkpoint to FILE after every epoch; resume from FILE if it exists",
     )
     sub.add_argument(
         "--incremental", action="store_true", help="update the map with one scan at a time"
@@ -121,39 +121,39 @@ def _fit(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--send",
         metavar="PATH",
-        help="with --incremental: after each scan, write what changed in the map as a packet, to a "
-        "folder or at the end of a .lhm file",
+        help="with --incremental: after each scan, write a packet with the changes of the map, to a "
+        "folder or to the end of a .lhm file",
     )
     _precision(sub)
     for option, program in (("mcap", "Foxglove: .mcap"), ("rerun", "Rerun: .rrd")):
         sub.add_argument(
             f"--{option}",
             metavar="FILE",
-            help=f"with --incremental: write clouds, growing surface and grid for {program}",
+            help=f"with --incremental: log clouds, surface and grid to a file for {program}",
         )
     sub.add_argument(
         "--log-every",
         type=int,
         default=10,
         metavar="N",
-        help="with --mcap or --rerun: write surface and grid every N scans and at the end (default: 10)",
+        help="with --mcap or --rerun: log surface and grid every N scans and at the end (default: 10)",
     )
     sub.add_argument(
         "--log-resolution",
         type=float,
         default=0.1,
         metavar="METERS",
-        help="with --mcap or --rerun: edge of a cell of surface and grid (default: 0.1)",
+        help="with --mcap or --rerun: cell size of surface and grid (default: 0.1)",
     )
     sub.add_argument(
         "--heights",
         nargs=2,
         type=finite,
         metavar=("LOW", "HIGH"),
-        help="with --mcap or --rerun: z of the lowest and highest obstacles in the grid of a 3-D map "
-        "[m]; without it there is no grid",
+        help="with --mcap or --rerun: lowest and highest z of obstacles in the grid of a 3-D map [m]; "
+        "without it, no grid of a 3-D map is logged",
     )
-    _radius(sub)
+    add_forgetting(sub)
     add_ranges(sub)
     _dim(sub)
     _seed(sub)
@@ -168,9 +168,9 @@ def _update(sub: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="map to write, which may be MAP itself; omit it for a tiled map, which is updated in place",
     )
-    text = "most clusters near a scan (default: chosen from the data)"
+    text = "maximum number of clusters near a scan (default: chosen from the data)"
     sub.add_argument("--clusters", type=int, metavar="N", help=text)
-    _radius(sub)
+    add_forgetting(sub)
     add_ranges(sub)
     _seed(sub)
 
@@ -181,11 +181,11 @@ def _file_verbs(verb: Any) -> None:
     sub.add_argument(
         "points", metavar="POINTS", help="(N, D) points as .npy or .npz, or any scan file"
     )
-    _output(sub, "float32 probabilities to write, in the order of the points: .npy")
+    _output(sub, "file to write: .npy, float32 probabilities in the order of the points")
     sub.add_argument(
         "--channel",
         metavar="NAME",
-        help="write the values of a channel of the map instead, such as color, or class for the "
+        help="write the values of a channel of the map instead, such as color; class gives the "
         "probability of each class",
     )
 
@@ -198,7 +198,7 @@ def _file_verbs(verb: Any) -> None:
         "--faces",
         type=int,
         metavar="N",
-        help="simplify the mesh to about N faces (default: do not)",
+        help="simplify the mesh to about N faces",
     )
 
     sub = verb(queries.grid)
@@ -208,29 +208,33 @@ def _file_verbs(verb: Any) -> None:
     )
     _resolution(sub, 0.1)
     sub.add_argument(
-        "--distance", action="store_true", help="signed distances to the nearest surface [m]; .npz"
+        "--distance",
+        action="store_true",
+        help="with .npz: write signed distances to the nearest surface [m] instead of probabilities",
     )
-    sub.add_argument("--sparse", action="store_true", help="with .npz: only blocks near clusters")
-    sub.add_argument("--channel", metavar="NAME", help="with .npz: a channel to write, too")
     sub.add_argument(
-        "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml, with its image"
+        "--sparse", action="store_true", help="with .npz: write only blocks of cells near clusters"
+    )
+    sub.add_argument("--channel", metavar="NAME", help="with .npz: also write this channel")
+    sub.add_argument(
+        "--nav2", metavar="FILE", help="write a map for Nav2's map_server: .yaml and an image"
     )
     sub.add_argument(
         "--heights",
         nargs=2,
         type=finite,
         metavar=("LOW", "HIGH"),
-        help="with --nav2: z of the lowest and highest obstacles of a 3-D map [m], above the floor",
+        help="with --nav2: lowest and highest z of obstacles in a 3-D map [m], above the floor",
     )
     sub.add_argument(
         "--mode",
         choices=("trinary", "scale"),
         default="trinary",
-        help="with --nav2: three values, or probabilities of known cells (default: trinary)",
+        help="with --nav2: occupied, free and unknown cells, or probabilities (default: trinary)",
     )
 
     sub = verb(queries.pack)
-    sub.add_argument("map", metavar="MAP", help=f"{MAP}; or packets, written by fit --send")
+    sub.add_argument("map", metavar="MAP", help=f"{MAP}; or packets written by fit --send")
     _output(sub, "packed map to write: .lhm")
     _precision(sub)
 
@@ -242,16 +246,16 @@ def _picture_verbs(verb: Any) -> None:
     sub.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve on; 0.0.0.0 allows other machines (default: 127.0.0.1)",
+        help="address to serve on; 0.0.0.0 accepts connections from other machines (default: 127.0.0.1)",
     )
     sub.add_argument(
         "--port",
         type=int,
         default=8080,
-        help="port to serve on; the next free one is used if it is taken (default: 8080)",
+        help="port to serve on; if it is in use, the next free one is used (default: 8080)",
     )
     sub.add_argument(
-        "--resolution", type=float, help="cell size of the surface [m] (default: from the map)"
+        "--resolution", type=float, help="cell size of the surface [m] (default: automatic)"
     )
     sub.add_argument(
         "--export", metavar="FILE", help="write the scene to a .html or .viser file and exit"
@@ -261,7 +265,7 @@ def _picture_verbs(verb: Any) -> None:
     sub.add_argument("map", metavar="MAP", help=MAP)
     _output(sub, "picture to write: .png")
     sub.add_argument(
-        "--slice", type=finite, metavar="Z", help="draw the probability at height Z [m] instead"
+        "--slice", type=finite, metavar="Z", help="draw the probability at height Z [m]"
     )
     _resolution(sub, 0.05)
     _surface(sub)
@@ -301,7 +305,8 @@ def _tile_verbs(verb: Any) -> None:
     sub.add_argument(
         "--halo",
         type=float,
-        help="width of the margin around a tile whose points also train it [m] (default: 0.5)",
+        help="width of the margin around a tile; the tile is also trained on the points in it [m] "
+        "(default: 0.5)",
     )
     _neighbors(sub)
     _dim(sub)
@@ -336,18 +341,8 @@ def _dim(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--dim",
         type=int,
-        help="dimension of the map; 2 drops a constant last coordinate (default: that of the "
-        "scans)",
-    )
-
-
-def _radius(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "--radius",
-        type=float,
-        metavar="METERS",
-        help="after each scan, remove clusters farther than this from the sensor (default: keep "
-        "all)",
+        help="dimension of the map; 2 drops a constant last coordinate of 3-D scans (default: that of "
+        "the scans)",
     )
 
 
@@ -360,7 +355,7 @@ def _precision(sub: argparse.ArgumentParser) -> None:
         "--precision",
         type=int,
         metavar="BITS",
-        help="fractional bits of packed parameters, 1 to 16 (default: 6)",
+        help="fractional bits of the rounded parameters of a packed map, 1 to 16 (default: 6)",
     )
 
 
@@ -390,6 +385,6 @@ def _surface(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--color",
         default="height",
-        help="what vertex colors show: height, cluster, probability, variance, or a channel of the "
+        help="quantity shown by colors: height, cluster, probability, variance, or a channel of the "
         "map, such as color, intensity or class (default: height)",
     )

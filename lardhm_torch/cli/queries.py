@@ -70,7 +70,7 @@ def grid(arguments: argparse.Namespace) -> None:
     if arguments.output is None and arguments.nav2 is None:
         raise ValueError("give --output or --nav2, or both")
     if arguments.nav2 is None and arguments.heights is not None:
-        raise ValueError("--heights needs --nav2; a grid of --output has all heights")
+        raise ValueError("--heights needs --nav2; a grid written to --output has all heights")
     for option in ("sparse", "distance", "channel"):
         if getattr(arguments, option) and arguments.output is None:
             raise ValueError(f"--{option} needs --output")
@@ -106,7 +106,7 @@ def grid(arguments: argparse.Namespace) -> None:
 
 
 def pack(arguments: argparse.Namespace) -> None:
-    """Write a small file of a map, to be sent: it answers queries, but does not learn."""
+    """Write a map as a compact file for transfer. It supports all queries, but no training."""
     from lardhm_torch.tiles.tiled_map import TiledMap, open_map
 
     check_output(arguments.output, (".lhm",), [arguments.map])
@@ -163,7 +163,7 @@ def _check_address(host: str, port: int) -> None:
 
 
 def render(arguments: argparse.Namespace) -> None:
-    """Draw a map to a picture; no display is needed."""
+    """Draw a map as a picture. No display is required."""
     import numpy as np
 
     from lardhm_torch.tiles.tiled_map import open_map
@@ -206,7 +206,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 
 def info(arguments: argparse.Namespace) -> None:
-    """Print the settings and the contents of a map, or what scan files hold and how they are read."""
+    """Print the settings and contents of a map, or the contents of scan files and how they are read."""
     from lardhm_torch.io.packed_files import is_packed
 
     if any(map(_is_scans, arguments.paths)):

@@ -1,4 +1,4 @@
-"""Arguments of the command line that say which scans are read, and how."""
+"""Arguments of the command line that select scans and how they are read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import math
 def add_scans(sub: argparse.ArgumentParser, nargs: str = "+", in_pieces: bool = False) -> None:
     """Add SCANS, how the files are read, and which scans and rays are kept.
 
-    Verbs that read files in pieces do not count scans: they have no ``--every``.
+    Commands that read files in pieces do not count scans, so they have no ``--every``.
     """
     sub.add_argument(
         "scans", nargs=nargs, metavar="SCANS", help="scan file, several files, or a folder"
@@ -25,12 +25,12 @@ def add_scans(sub: argparse.ArgumentParser, nargs: str = "+", in_pieces: bool = 
         "--voxel",
         type=_positive,
         metavar="METERS",
-        help="keep one ray of each scan per voxel of this size (default: keep all)",
+        help="keep one ray per scan and voxel of this size (default: keep all)",
     )
 
 
 def add_reading(sub: argparse.ArgumentParser) -> None:
-    """Add the options that say how scan files are read."""
+    """Add the options that determine how scan files are read."""
     sub.add_argument(
         "--origin",
         type=_numbers,
@@ -40,13 +40,14 @@ def add_reading(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--frame",
         choices=("sensor", "world"),
-        help="frame of the points beside a pose file. sensor: the poses transform them; world: "
-        "the poses only give the sensor positions (default: world, and pose files are not read)",
+        help="frame of the points if there is a pose file. sensor: points are transformed by the "
+        "poses; world: the poses only give the sensor positions (default: points are in the world "
+        "frame, and pose files are ignored)",
     )
     sub.add_argument(
         "--poses-frame",
         metavar="FRAME",
-        help="whose poses a pose file contains: camera or lidar (default: camera beside "
+        help="whose poses a pose file contains: camera or lidar (default: camera if there is a "
         "calib.txt); for a bag: the tf frame of the pose topic",
     )
     sub.add_argument(
@@ -62,7 +63,9 @@ def add_reading(sub: argparse.ArgumentParser) -> None:
     )
     _add_depth_images(sub)
     sub.add_argument(
-        "--strict", action="store_true", help="fail where the reader would have to guess"
+        "--strict",
+        action="store_true",
+        help="report an error instead of guessing what a file means",
     )
 
 
@@ -71,7 +74,7 @@ def _add_depth_images(sub: argparse.ArgumentParser) -> None:
         "--camera",
         type=_numbers,
         metavar="FX,FY,CX,CY",
-        help="intrinsics of depth images that come without them [pixels]",
+        help="intrinsics of depth images, for folders that do not contain them [pixels]",
     )
     sub.add_argument(
         "--pixel-step",
@@ -94,13 +97,13 @@ def add_ranges(sub: argparse.ArgumentParser) -> None:
         "--min-range",
         type=float,
         metavar="METERS",
-        help="drop shorter rays, which end in the sensor's own body (default: 0.3)",
+        help="drop rays shorter than this, which end on the robot itself (default: 0.3)",
     )
     sub.add_argument(
         "--max-range",
         type=float,
         metavar="METERS",
-        help="cut longer rays, which then have no hit (default: 100)",
+        help="truncate longer rays, which then count as no-return (default: 100)",
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def read_scans(arguments: argparse.Namespace, dim: int | None = None) -> Scans:
-    """The scans named on the command line, without z where ``--dim 2`` or a 2-D map asks for it."""
+    """The scans named on the command line, without z for ``--dim 2`` or a 2-D map."""
     from lardhm_torch import load_scans
     from lardhm_torch.scans import every_scan, thin_rays
 
@@ -44,7 +44,7 @@ def iter_pieces_of(arguments: argparse.Namespace, dim: int | None = None) -> Ite
     from lardhm_torch.scans import thin_rays
 
     if arguments.every != 1:
-        raise ValueError("--every is not for tiled maps, which read files in pieces")
+        raise ValueError("--every cannot be used with tiled maps, which read files in pieces")
     is_empty = True
     for piece in iter_pieces(arguments.scans, Reading(**_reading(arguments))):
         is_empty = False
@@ -67,7 +67,7 @@ def describe_scans(arguments: argparse.Namespace) -> ScanReport:
 
 
 def sampling_of(arguments: argparse.Namespace) -> SamplingConfig:
-    """The sampling with ``--min-range`` and ``--max-range`` put in."""
+    """The sampling settings with ``--min-range`` and ``--max-range``."""
     from lardhm_torch import SamplingConfig
 
     limits = {"min_range": arguments.min_range, "max_range": arguments.max_range}
@@ -75,14 +75,14 @@ def sampling_of(arguments: argparse.Namespace) -> SamplingConfig:
 
 
 def far_hits(arguments: argparse.Namespace) -> str:
-    """How many hits were lost to ``--max-range``, for the line that a verb ends with."""
+    """How many hits lie beyond ``--max-range``, for the last line that a command prints."""
     count = arguments.num_far
     limit = sampling_of(arguments).max_range
     return f"; {count} hits beyond {limit:g} m (no hit, free space kept)" if count else ""
 
 
 def _count_far(scans: Scans, arguments: argparse.Namespace) -> None:
-    """Add up the hits beyond the maximum range, for verbs that sample."""
+    """Count the hits beyond the maximum range, for commands that sample rays."""
     if hasattr(arguments, "max_range"):
         far = scans.is_return & (scans.ranges > sampling_of(arguments).max_range)
         arguments.num_far += int(far.sum())
@@ -122,7 +122,7 @@ def _with_dim(scans: Scans, arguments: argparse.Namespace, dim: int | None) -> S
 
 
 def report_dropped(dropped: dict[str, int]) -> None:
-    """Say on the error stream which rays were left out, and why."""
+    """Print to the error stream which rays were left out, and why."""
     for reason, count in dropped.items():
         if count:
             print(f"{count} rays: {reason}", file=sys.stderr)

@@ -13,7 +13,7 @@ from lardhm_torch.cli.scan_files import far_hits, iter_pieces_of, sampling_of
 
 
 def tile(arguments: argparse.Namespace) -> None:
-    """Distribute the training points of scans, which may exceed memory, to tiles."""
+    """Sample scans, which may be too large for memory, and write the training points of each tile."""
     from lardhm_torch.tiles.routing import TilingConfig, tile_scans
 
     config = TilingConfig(
@@ -33,7 +33,7 @@ def tile(arguments: argparse.Namespace) -> None:
 
 
 def fit_tiles(arguments: argparse.Namespace) -> None:
-    """Fit the tiles of a folder; resumes after an interruption and runs under torchrun."""
+    """Fit the tiles of a folder. Resumes after an interruption and can be run by torchrun."""
     from lardhm_torch.tiles import fitting
 
     manifest = fitting.fit_tiles(arguments.folder, progress=True)
@@ -52,8 +52,8 @@ def update_folder(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--output must be omitted: {arguments.map} is updated in place")
     if arguments.min_range is not None or arguments.max_range is not None:
         raise ValueError("--min-range and --max-range were fixed by `lardhm tile`; omit them")
-    if arguments.clusters is not None or arguments.radius is not None:
-        raise ValueError("--clusters and --radius do not apply to tiled maps")
+    if any(v is not None for v in (arguments.clusters, arguments.radius, arguments.max_age)):
+        raise ValueError("--clusters, --radius and --max-age do not apply to tiled maps")
     dim = read_manifest(arguments.map).dim
     _, touched = add_scans(iter_pieces_of(arguments, dim), arguments.map, progress=True)
     manifest = fit_tiles(arguments.map, progress=True)

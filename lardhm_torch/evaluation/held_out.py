@@ -21,9 +21,9 @@ QUERY_POINTS = 1 << 20  # points queried at a time
 
 
 class HeldOut(NamedTuple):
-    """Test points of R rays, each (R, D) float64 in the world frame [m]; or values at them.
+    """Test points of R rays, each (R, D) float64 in the world frame [m]; or values at these points.
 
-    ``hits`` are occupied, all others free: ``unif`` uniform from the sensor to 0.2 m before the
+    ``hits`` are occupied. The others are free: ``unif`` uniform from the sensor to 0.2 m before the
     hit, ``near`` between 0.6 m and 0.2 m before it, ``paper`` uniform over the first 95 % of the
     ray, as in the paper.
     """
@@ -143,13 +143,13 @@ def evaluate(
     Args:
         model: a map, a baseline, or any function (N, D) world positions [m] -> (N,) probability of
             occupancy, as a tensor or an array.
-        scans: rays that were not used for training; those outside of 0.3 m to 60 m, later returns
-            and no-returns are ignored.
+        scans: rays that were not used for training. Rays shorter than 0.3 m or longer than 60 m,
+            later returns and no-returns are ignored.
         seed: random seed of the test points.
 
     Returns:
-        for each kind of free point ("unif", "near", "paper", see `HeldOut`) a dictionary of scores,
-        see `occupancy_metrics`.
+        a dictionary of scores (see `occupancy_metrics`) for each kind of free point: "unif", "near"
+        and "paper" (see `HeldOut`).
 
     Raises:
         ValueError: no ray is usable, or the model does not return one probability per point.

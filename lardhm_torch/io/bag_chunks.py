@@ -39,13 +39,13 @@ class Unpacker:
         """The bytes of a chunk; size is how many there must be, None if it does not say."""
         limit = self.left if size is None else size
         if limit > self.left or limit < 0 or (compression == "lz4" and limit > 256 * len(packed)):
-            raise ValueError(f"a chunk promises {size} bytes, more than the file can hold")
+            raise ValueError(f"a chunk declares {size} bytes, more than the file can hold")
         if compression in ("", "none"):
             content = packed
         else:
             content = memoryview(_decompressor(compression)(bytes(packed), limit + 1))
         if len(content) > limit or (size is not None and len(content) != size):
-            raise ValueError(f"a chunk promises {size} bytes; got {len(content)} or more")
+            raise ValueError(f"a chunk declares {size} bytes; got {len(content)} or more")
         self.left -= len(content) + _LEAST_BYTES
         return content
 
@@ -88,7 +88,7 @@ class Packed:
         """The next count bytes."""
         end = self.position + count
         if end > len(self.content):
-            raise ValueError(f"{count} bytes are promised; a record ends before")
+            raise ValueError(f"{count} bytes are declared; a record ends before")
         piece = self.content[self.position : end]
         self.position = end
         return piece
@@ -105,5 +105,5 @@ class Packed:
 def take(file: BinaryIO, count: int) -> memoryview:
     """The next count bytes of a file, allocated only if they are there."""
     if count > bytes_left(file):
-        raise ValueError(f"{count} bytes are promised at {file.tell()}; got {bytes_left(file)}")
+        raise ValueError(f"{count} bytes are declared at {file.tell()}; got {bytes_left(file)}")
     return memoryview(file.read(count))

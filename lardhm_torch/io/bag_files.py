@@ -1,7 +1,7 @@
 """The messages of ROS bags, one after the other, whatever the container.
 
-The containers are read here and not by a library because a broken bag must neither take memory by
-the word of its headers nor unpack without limit. What the messages mean is `bag_scans`'s.
+The containers are read here and not by a library, because a damaged bag must neither allocate the
+sizes in its headers nor decompress without limit. `bag_scans` interprets the messages.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class BagParts:
 
     Args:
         files: the files to read.
-        num_messages: how many messages metadata.yaml promises; None if it does not say.
+        num_messages: how many messages metadata.yaml declares; None if it gives none.
         notes: what was assumed or left out.
     """
 

@@ -1,4 +1,4 @@
-"""Where a sensor stood for each cloud of a ROS bag: by tf, or by a topic of poses."""
+"""Sensor position of each cloud of a ROS bag: from tf, or from a topic of poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lardhm_torch.io.notes import Note
 from lardhm_torch.io.trajectories import Trajectory, poses_from_quaternions, trajectory_from
 from lardhm_torch.io.transforms import TransformTree, is_pose_row
 
-# Frames that stand still, by the usual names (REP 105, LOAM): map, odom, camera_init, my_world, ...
+# Static frames, by their usual names (REP 105, LOAM): map, odom, camera_init, my_world, ...
 _FIXED = {"map", "odom", "odometry", "world", "earth", "utm", "enu", "ned", "init", "global"}
 
 
@@ -53,7 +53,7 @@ class PoseTopic:
 
 @dataclass(frozen=True)
 class CloudPoses:
-    """For each of n clouds, how it lies in the world and where its sensor stood.
+    """For each of n clouds, its pose in the world and the position of its sensor.
 
     Args:
         world_from_cloud: (n, 4, 4) poses that move the points.
@@ -144,7 +144,7 @@ def _by_tf(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -> Clo
     notes = [Note(f"poses of {frame} from tf")]
     if not sources.tree.moves(frame):
         cure = "" if sources.sensor_frame else f"sensor_frame='{frame}' confirms it"
-        notes = [Note(f"{frame} never moves in tf: taken to stand still", cure=cure)]
+        notes = [Note(f"{frame} never moves in tf: assumed to be static", cure=cure)]
     return CloudPoses(poses, poses[:, :3, 3], gaps, tuple(notes))
 
 
@@ -162,13 +162,13 @@ def _seen_from_sensor(
         if not below or sources.sensor_frame:
             return poses
         cure = f"sensor_frame='{frame}' confirms it; below it are {', '.join(below[:5])}"
-        note = Note(f"sensor taken to be at the origin of {frame}", cure=cure, is_loss=is_base)
+        note = Note(f"sensor assumed to be at the origin of {frame}", cure=cure, is_loss=is_base)
         return replace(poses, notes=(*poses.notes, note))
     found = sources.tree.between(frame, sensor, stamps)
     if found is None:
         raise ValueError(f"tf must connect {frame} and {sensor}; it does not")
     cure = "" if sources.sensor_frame else f"sensor_frame='{sensor}' confirms it"
-    note = Note(f"clouds are in {frame}; sensor taken to be at {sensor}", cure=cure)
+    note = Note(f"clouds are in {frame}; sensor assumed to be at {sensor}", cure=cure)
     positions = (poses.world_from_cloud @ found[0])[:, :3, 3]
     gaps = np.maximum(poses.gaps, found[1])
     return CloudPoses(poses.world_from_cloud, positions, gaps, (*poses.notes, note))
@@ -191,8 +191,8 @@ def _seen_in_fixed_frame(
     if sources.topics:
         return None
     raise ValueError(
-        f"clouds are in {frame}, a fixed frame: where the sensor stood must come from tf or a topic "
-        f'of poses, and neither says it. If {frame} is the sensor\'s: sensor_frame="{frame}"'
+        f"clouds are in {frame}, a fixed frame: the sensor position must come from tf or a topic "
+        f'of poses, and neither gives it. If {frame} is the sensor\'s: sensor_frame="{frame}"'
     )
 
 
@@ -220,11 +220,11 @@ def _seen_by_topic(
 def _mount_below(
     sources: PoseSources, topic: PoseTopic, stamps: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Note]:
-    """Where the sensor sits in the frame that a topic of poses moves."""
+    """Pose of the sensor in the frame of a pose topic."""
     child = sources.poses_frame or topic.child or _only_base(sources.tree)
     nowhere = np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps))
     if not child or child not in sources.tree.frames:
-        cure = f"poses_frame says of which frame {topic.name} is" if sources.tree.frames else ""
+        cure = f"poses_frame names the frame of {topic.name}" if sources.tree.frames else ""
         text = f"sensor at the poses of {topic.name}"
         return *nowhere, Note(text, cure=cure, is_loss=bool(cure))
     if sources.sensor_frame is None and not _sensors_below(sources.tree, child):
@@ -256,7 +256,7 @@ def _sensor_below(sources: PoseSources, frame: str) -> tuple[str, Note]:
         )
     cure = f"sensor_frame='{candidates[0]}' confirms it"
     return candidates[0], Note(
-        f"clouds are in {frame}; sensor taken to be at {candidates[0]}", cure=cure
+        f"clouds are in {frame}; sensor assumed to be at {candidates[0]}", cure=cure
     )
 
 
@@ -271,8 +271,8 @@ def _by_topic(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -> 
         if child != frame:
             notes.append(
                 Note(
-                    f"{topic.name} does not say of which frame its poses are: taken to be {child}'s",
-                    cure=f"poses_frame='{child}' confirms it, poses_frame='{frame}' is without mount",
+                    f"{topic.name} does not name the frame of its poses: assumed to be {child}",
+                    cure=f"poses_frame='{child}' confirms it, poses_frame='{frame}' ignores the mount",
                 )
             )
     if child != frame:
@@ -281,7 +281,7 @@ def _by_topic(sources: PoseSources, frame: str, stamps: NDArray[np.float64]) -> 
             notes.append(
                 Note(
                     f"tf does not connect {child} of the poses with {frame} of the clouds: they are "
-                    "taken to be the same",
+                    "assumed to be the same",
                     cure=f"poses_frame='{frame}' confirms it",
                     is_loss=True,
                 )

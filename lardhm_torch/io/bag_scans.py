@@ -1,4 +1,4 @@
-"""ROS bags to rays: which messages are the scans, and where the sensor stood."""
+"""Rays from ROS bags: messages that are scans, and their sensor positions."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _bag_notes(parts: BagParts, bag: _Bag, topic: str) -> list[Note]:
     notes = [Note(f"rays from {topic} ({bag.kinds[topic]})")]
     notes += parts.notes
     if parts.num_messages is not None and parts.num_messages != bag.num_messages:
-        text = f"messages, but metadata.yaml promises {parts.num_messages}"
+        text = f"messages, but metadata.yaml declares {parts.num_messages}"
         notes.append(Note(text, bag.num_messages, is_loss=True))
     ignored = bag.tree.num_ignored + sum(poses.num_ignored for poses in bag.poses.values())
     if ignored:
@@ -190,6 +190,7 @@ def _readout(clouds: list[Cloud], poses: CloudPoses, notes: list[Note]) -> Reado
         is_return=_returns([clouds[i] for i in placed]),
         notes=(*notes, *poses.notes),
         channels=joined_columns([(clouds[i].channels, len(clouds[i].points)) for i in placed]),
+        scan_times=np.array([clouds[i].stamp for i in placed]),
     )
 
 

@@ -105,7 +105,7 @@ def _check_before_opening(path: Path) -> None:
         pages = xml_size // (_PAGE - 4) + 2
         if length != size or size % _PAGE or not 48 <= xml_at <= xml_at + xml_size <= size:
             raise ValueError(
-                f"{length} bytes in pages of {_PAGE} are promised, XML of {xml_size} bytes at "
+                f"{length} bytes in pages of {_PAGE} are declared, XML of {xml_size} bytes at "
                 f"{xml_at}; got {size} bytes"
             )
         file.seek(xml_at - xml_at % _PAGE)
@@ -125,7 +125,7 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
     if names is None:
         raise ValueError(f"coordinates are needed; got {', '.join(header.point_fields)}")
     if count * _LEAST_BYTES > size:
-        raise ValueError(f"{count} points are promised; {size} bytes are too few")
+        raise ValueError(f"{count} points are declared; {size} bytes are too few")
     state = names[0].removesuffix("X").removesuffix("Range") + "InvalidState"
     others = (state, "returnIndex", *CHANNEL_FIELDS)
     wanted = [*names, *(n for n in others if n in header.point_fields)]
@@ -142,7 +142,7 @@ def _read_columns(file: Any, header: Any, size: int) -> dict[str, NDArray[np.flo
         left -= got
     reader.close()
     if left:
-        raise ValueError(f"{count} points are promised; got {count - left}")
+        raise ValueError(f"{count} points are declared; got {count - left}")
     columns = {name: np.concatenate([part[name] for part in pieces]) for name in wanted}
     columns["state"] = columns.pop(state, np.zeros(count))
     white = white_of(header)

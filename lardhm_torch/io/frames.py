@@ -24,17 +24,16 @@ def placed(
 ) -> Readout:
     """Points and origin by the file's pose: that of a pose file, or, in the sensor's frame, its own.
 
-    Without a frame points are left where they are, unless the file's own pose rotates.
+    Without a frame, points are left where they are, unless the file's own pose has a rotation.
 
     Raises:
-        ValueError: the format says its frame itself, or there is no pose for points of the sensor
-            frame.
+        ValueError: the format states its frame, or there is no pose for points in the sensor frame.
     """
     if frame is None:
         return _as_written(readout, file)
     if file.suffix.lower() not in _WITHOUT_FRAME and not _lacks_pose(readout, file):
         raise ValueError(
-            f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats say it themselves, '
+            f'frame="{frame}" is for {" ".join(_WITHOUT_FRAME)}: other formats state their frame, '
             "unless a single scan of .e57 or .ptx has no pose"
         )
     pose = pose_beside(file, poses_frame)
@@ -66,8 +65,8 @@ def _as_written(readout: Readout, file: Path) -> Readout:
         return seen_beams(readout)
     if np.abs(pose[:3, :3] - np.eye(3)).max() > _LEAST_ROTATION:
         raise ValueError(
-            "its pose (VIEWPOINT) rotates: the points may still be in the sensor frame. Say it: "
-            'frame="sensor" moves them by the pose, frame="world" leaves them and takes the '
+            "its pose (VIEWPOINT) has a rotation, so the points may be in the sensor frame. Choose: "
+            'frame="sensor" transforms them by the pose, frame="world" leaves them and takes the '
             "position alone; --frame on the command line"
         )
     readout = seen_beams(readout)
@@ -75,8 +74,8 @@ def _as_written(readout: Readout, file: Path) -> Readout:
     unused = "" if beside is None else f", and {beside.name} beside it is not used"
     return readout.noting(
         Note(
-            f"points taken to be in the world frame already{unused}",
-            cure='frame="world" confirms it, frame="sensor" moves them by the pose; --frame',
+            f"points assumed to be in the world frame{unused}",
+            cure='frame="world" confirms it, frame="sensor" transforms them by the pose; --frame',
         )
     )
 
@@ -91,7 +90,11 @@ def moved(readout: Readout, pose: FoundPose) -> Readout:
         ends=move_points(pose.world_from_sensor, readout.ends),
         origins=np.full((readout.num_scans, 3), pose.world_from_sensor[:3, 3]),
         origin_is_placeholder=False,
-        notes=(*readout.notes, *pose.notes, Note("points in the sensor frame, moved by the pose")),
+        notes=(
+            *readout.notes,
+            *pose.notes,
+            Note("points in the sensor frame, transformed by the pose"),
+        ),
     )
 
 

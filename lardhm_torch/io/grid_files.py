@@ -61,36 +61,36 @@ def save_grid(
     | ``.bt`` | OctoMap: occupied and free cells, the rest unknown |
     | ``.ot`` | OctoMap: log-odds, clamped as OctoMap does (-2 and 3.511), pruned |
 
-    A sparse ``.npz`` holds only blocks of 8 x 8 x 8 cells that a cluster's box of three standard
-    deviations touches: ``probability`` (B, 8, 8, 8) float32 and ``blocks`` (B, 3), the first cell of
-    each, counted from the one at ``lower``. All other cells are unknown. It is written block by block,
-    so memory does not grow with the map.
+    A sparse ``.npz`` contains only blocks of 8 x 8 x 8 cells that touch the box of a cluster (three
+    standard deviations): ``probability`` (B, 8, 8, 8) float32 and ``blocks`` (B, 3), the index of the
+    first cell of each block, relative to the cell at ``lower``. All other cells are unknown. The file is
+    written block by block, so memory does not grow with the map.
 
-    A ``channel`` of the map is written to a ``.npz`` beside the probability, as an array of the same
-    shape, named ``color``, ``intensity``, ``class`` or ``channel_NAME``: float32, (..., C) for C values,
-    NaN where unknown; of ``class`` the most likely class of each cell, int32, -1 where unknown.
+    A ``channel`` of the map is written to the ``.npz`` as another array of the same shape, named
+    ``color``, ``intensity``, ``class`` or ``channel_NAME``: float32, (..., C) for C values, NaN where
+    unknown; for ``class``, the most likely class of each cell, int32, -1 where unknown.
 
-    An OctoMap cell has the highest log-odds of the centers of its eight parts, since surfaces are
-    thinner than cells and OctoMap too lets occupied win. It is known where they are 1 or more away
-    from 0 (probability 0.27, 0.73).
+    An OctoMap cell has the highest log-odds of the centers of its eight octants, because surfaces are
+    thinner than cells and OctoMap also prefers occupied. A cell is unknown if its log-odds are between
+    -1 and 1 (probability 0.27 and 0.73).
 
     Args:
         model: a map; for OctoMap a 3-D one.
-        path: a file that ends in .npz, .bt or .ot; an old one is replaced at the end.
+        path: a file that ends in .npz, .bt or .ot; an existing file is replaced atomically.
         resolution: edge of a cell [m].
         bounds: lower and upper corner of the part to write, world frame [m]; None: all of it.
         distance: write signed distances to the nearest surface instead of probabilities.
         sparse: write a sparse ``.npz``, of a 3-D map.
-        channel: name of a channel to write, too, to ``.npz``.
+        channel: name of a channel to write to the ``.npz`` in addition to the probability.
 
     Returns:
         The number of cells written.
 
     Raises:
-        ValueError: the extension is another (of distances: not .npz), the map is empty or has the
-            wrong dimension or no such channel, the map lies outside what an OctoMap of this
-            resolution spans, or the grid would not fit in memory.
-        ImportError: an OctoMap is asked for and octomap-python is not installed.
+        ValueError: the extension is unknown (for distances: not .npz), the map is empty or has the
+            wrong dimension or no such channel, the map exceeds the range of an OctoMap of this
+            resolution, or the grid would not fit in memory.
+        ImportError: OctoMap output is requested and octomap-python is not installed.
         FileNotFoundError: the folder of path does not exist.
     """
     suffix = Path(path).suffix.lower()

@@ -84,7 +84,7 @@ def _las_pieces(path: Path, max_points: int | None) -> Iterator[tuple[Readout, f
             white = white_of(points, white)
             yield _readout_of(points, with_times, white), white
     if got == 0 or got != header.count:
-        raise ValueError(f"{header.count} points are promised, one is needed at least; got {got}")
+        raise ValueError(f"{header.count} points are declared, one is needed at least; got {got}")
 
 
 def _readout_of(points: Any, with_times: bool, white: float) -> Readout:
@@ -149,7 +149,7 @@ class _Header:
         self.is_compressed = bool(point_format & 0xC0)
         if not self.header_size + self.num_vlrs * _VLR_BYTES <= self.points_at <= size:
             raise ValueError(
-                f"{self.num_vlrs} variable records are promised before byte {self.points_at}; "
+                f"{self.num_vlrs} variable records are declared before byte {self.points_at}; "
                 f"the file has {size} bytes"
             )
         left = size - self.points_at
@@ -157,7 +157,7 @@ class _Header:
             not self.is_compressed and self.count * self.point_bytes > left
         ):
             raise ValueError(
-                f"{self.count} points of {self.point_bytes} bytes are promised; got {left} bytes"
+                f"{self.count} points of {self.point_bytes} bytes are declared; got {left} bytes"
             )
 
 
@@ -183,7 +183,7 @@ def _check_compressed(file: BinaryIO, header: _Header) -> None:
         position = file.tell() + sum(sizes[1:])
     if position != table_at or count != header.count:
         raise ValueError(
-            f"{header.count} points are promised up to byte {table_at}; "
+            f"{header.count} points are declared up to byte {table_at}; "
             f"the chunks hold {count} up to byte {position}"
         )
 
@@ -215,11 +215,11 @@ def _chunk_table_at(file: BinaryIO, header: _Header) -> int | None:
         file.seek(header.size - 8)
         (table_at,) = _unpack(file, "<q")
     if not header.points_at + 8 <= table_at <= header.size - 8:
-        raise ValueError(f"the chunk table is promised at byte {table_at} of {header.size}")
+        raise ValueError(f"the chunk table is declared at byte {table_at} of {header.size}")
     file.seek(table_at + 4)
     (num_chunks,) = _unpack(file, "<I")
     if num_chunks > table_at - header.points_at:
-        raise ValueError(f"{num_chunks} chunks are promised in a file of {header.size} bytes")
+        raise ValueError(f"{num_chunks} chunks are declared in a file of {header.size} bytes")
     return table_at
 
 

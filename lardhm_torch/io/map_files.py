@@ -6,7 +6,7 @@ The extension of the path chooses the format (docs/map_format.md describes the c
 - any other: torch's own format, a zip file with a CRC-32 for each entry, which is verified here
   because `torch.load` does not.
 
-No code in a file is ever run.
+Code in a file is never executed.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from lardhm_torch.io.atomic_files import replaced_file
 
 FORMAT_VERSION = 2
 # In the extra state of maps with channels or of packed maps, beside the settings.
-NOT_SETTINGS = ("channels", "class_scale", "is_packed")
+NOT_SETTINGS = ("channels", "class_scale", "is_packed", "max_age")
 STREAM_KEY = "_stream"  # beside the tensors of a checkpoint: how many scans were processed
 SAFETENSORS = ".safetensors"
 MSDOS_DIRECTORY = 0x10  # attribute of a zip entry, beside its checksum: torch reads 0 bytes of it
 
 
 def save_state(state: dict[str, Any], path: str | os.PathLike[str]) -> None:
-    """Write a state dict atomically: if writing fails, an existing file stays as it was.
+    """Write a state dict atomically: if writing fails, an existing file is unchanged.
 
     Args:
         state: tensors and plain Python values by name.
@@ -73,7 +73,9 @@ def load_state(path: str | os.PathLike[str]) -> dict[str, Any]:
     except Exception as error:
         # Damaged bytes raise a dozen exception types from pickle, zipfile, torch and safetensors.
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise ValueError(f"{path} must be a map file, whole and safe to load; {reason}") from error
+        raise ValueError(
+            f"{path} must be a complete map file that is safe to load; {reason}"
+        ) from error
     if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
         raise ValueError(f"{path} must hold a state dict; got {type(state).__name__}")
     return state

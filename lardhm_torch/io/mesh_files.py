@@ -18,11 +18,11 @@ MESH_SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 
 
 def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
-    """Write a mesh, its format chosen by the extension; an existing file is replaced at the end.
+    """Write a mesh in the format of the extension; an existing file is replaced atomically.
 
-    Far from zero (UTM) float32 is too coarse for a mesh: .ply then holds float64, .glb a mesh near
-    zero and a shift; .obj and .off hold text anyway; .stl cannot, and a warning says so.
-    .ply, .glb and .obj hold vertex colors; .ply also the vertex attribute "label".
+    Far from zero (UTM), float32 is too coarse for a mesh. Then .ply stores float64, and .glb a mesh
+    near zero with a translation; .obj and .off are text. .stl always stores float32, so a warning is
+    issued. .ply, .glb and .obj store vertex colors; .ply also the vertex attribute "label".
 
     Args:
         mesh: the mesh [m].
@@ -51,7 +51,7 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
             mesh.export(partial, file_type=suffix[1:])
     if is_coarse and suffix == ".stl":
         warnings.warn(
-            f"STL holds float32, which moved vertices by up to {error:.2g} m; .ply does not",
+            f"STL stores float32, which moved vertices by up to {error:.2g} m; .ply does not",
             stacklevel=2,
         )
 

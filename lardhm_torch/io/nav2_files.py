@@ -75,20 +75,20 @@ def save_nav2(
 ) -> tuple[int, int]:
     """Write the map as an occupancy grid for Nav2's map_server.
 
-    Writes a YAML file and an image of the same name: ``.pgm`` in trinary mode, ``.png`` in scale mode,
-    whose transparent pixels are unknown. Cells lie at whole multiples of the resolution; the first row of
-    the image has the largest y.
+    The output is a YAML file and an image of the same name: ``.pgm`` in trinary mode, or ``.png`` in
+    scale mode, where unknown cells are transparent. Cells lie at whole multiples of the resolution; the
+    first row of the image has the largest y.
 
-    Like an OctoMap that is projected to the ground, a cell is occupied if the log-odds are 1 or more
-    (probability 0.73) anywhere in it; else free if they are -1 or less somewhere; else unknown. They are
-    evaluated twice per cell along each axis, within the height band.
+    As in an OctoMap projected to the ground, a cell is occupied if the log-odds are 1 or more
+    (probability 0.73) anywhere in it. Otherwise it is free if they are -1 or less anywhere in it, and
+    unknown if not. They are evaluated twice per cell along each axis, within the given heights.
 
     Args:
         model: a map of 2 or 3 dimensions.
-        path: YAML file that ends in .yaml or .yml; existing files are replaced at the end.
+        path: YAML file that ends in .yaml or .yml; existing files are replaced atomically.
         resolution: edge of a cell [m].
-        heights: lowest and highest z of obstacles for the robot [m]; needed in 3-D. The floor must lie
-            below the band.
+        heights: lowest and highest z of obstacles for the robot [m]; required in 3-D. The lowest z
+            must be above the floor.
         bounds: lower and upper (x, y) of the grid [m]; further coordinates are ignored. None: all known
             cells.
         mode: "trinary" (occupied, free, unknown) or "scale" (probabilities of known cells).
@@ -97,8 +97,8 @@ def save_nav2(
         Width and height of the image in cells.
 
     Raises:
-        ValueError: the extension or mode is another, the map is empty, heights do not fit the dimension
-            of the map, no cell is known, or the image would not fit in memory.
+        ValueError: the extension or mode is unknown, the map is empty, heights do not match the
+            dimension of the map, no cell is known, or the image would not fit in memory.
         FileNotFoundError: the folder of path does not exist.
     """
     target = Path(path)

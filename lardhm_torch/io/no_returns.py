@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.readout import Readout
 
-NO_RETURNS = "beams without return, taken to be free up to the longest range of their scan"
+NO_RETURNS = "beams without return, assumed to be free up to the longest range of their scan"
 _LARGEST_MISFIT = 0.5  # of a step of the grid
 
 
@@ -89,6 +89,6 @@ def with_free_beams(readout: Readout, sensor: NDArray[np.float64]) -> Readout:
     longest = np.linalg.norm(points[~is_lost], axis=1).max()
     ends = readout.ends.copy()
     ends[is_beam] = sensor + longest * directions[is_beam]
-    cure = "a field is_return says it"
+    cure = "a field is_return specifies it"
     note = Note(NO_RETURNS, int(is_beam.sum()), cure=cure)
     return replace(readout, ends=ends, is_return=~is_beam).noting(note)

@@ -1,4 +1,4 @@
-"""What readers assumed about scan files, and how that is reported.
+"""Assumptions of readers about scan files, and how they are reported.
 
 Every reader attaches a few `Note`s to what it reads. The public functions collect them in a
 `ScanReport`, which prints as one line; ``strict=True`` turns every guess into an error.
@@ -19,7 +19,7 @@ from lardhm_torch.scans import Scans
 
 
 class ScanFileWarning(UserWarning):
-    """Part of a scan file was left out: the scans are usable, but incomplete."""
+    """Part of a scan file was left out. The scans are usable, but incomplete."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Note:
         text: the statement, such as "sensor position from VIEWPOINT". Files with equal texts are
             reported together, so that numbers go into ``count``.
         count: how many points, clouds or images it concerns; printed before the text.
-        cure: what confirms or changes a guess, such as "frame='world' confirms it"; empty where
-            the file or the caller says it, and nothing was guessed.
-        is_loss: something that may matter was left out; the caller gets a `ScanFileWarning`.
+        cure: how to confirm or change a guess, such as "frame='world' confirms it"; empty if nothing
+            was guessed, because the file or the caller specifies it.
+        is_loss: data that may matter was left out; a `ScanFileWarning` is issued.
     """
 
     text: str
@@ -42,7 +42,7 @@ class Note:
 
     @property
     def is_guess(self) -> bool:
-        """Whether neither the file nor the caller says it."""
+        """Whether the statement is a guess, specified neither by the file nor by the caller."""
         return bool(self.cure)
 
     def __str__(self) -> str:
@@ -70,9 +70,9 @@ def no_ray_left(files: Sequence[Path], notes: Sequence[Note]) -> ValueError:
 
 
 class ScanReport:
-    """What was read from scan files, and what was assumed; `str` gives one line.
+    """Contents of scan files and assumptions of the readers; `str(report)` is one line.
 
-    Pass an empty one to `load_scans`, `iter_scans` or `iter_pieces`; they fill it file by file.
+    Pass an empty report to `load_scans`, `iter_scans` or `iter_pieces`; they fill it file by file.
     """
 
     def __init__(self) -> None:

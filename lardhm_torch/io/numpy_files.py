@@ -28,6 +28,7 @@ _PREFIX = "channel_"
 def read_npz(path: Path) -> Readout:
     """Scans from ``points``, ``origins``, ``scan_id`` and optional ``is_return``, ``target_index``.
 
+    ``scan_times`` (S,) holds a time stamp [s] for each origin.
     ``scan_id`` may be left out where there is one origin. Arrays ``color``, ``intensity``, ``class``
     and ``channel_NAME`` of one row per point are channels (see `lardhm_torch.channels`).
 
@@ -40,8 +41,8 @@ def read_npz(path: Path) -> Readout:
             values = _optional(archive, name)
             if values is not None:
                 columns[name] = values
-        origins = _origins_of(archive, "scan_id" in columns)
-    return _npz_piece(columns, origins)
+        scans = _scans_of(archive, "scan_id" in columns)
+    return _npz_piece(columns, *scans)
 
 
 def npz_pieces(path: Path, max_points: int) -> Iterator[Readout]:
@@ -54,15 +55,17 @@ def npz_pieces(path: Path, max_points: int) -> Iterator[Readout]:
         if "points" not in columns or any(not column.in_rows for column in columns.values()):
             yield read_npz(path)  # reports missing arrays, or transposes
             return
-        origins = _origins_of(archive, "scan_id" in columns)
+        scans = _scans_of(archive, "scan_id" in columns)
         lengths = {name: column.length for name, column in columns.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"arrays must have one entry a point; got {lengths}")
         for _ in range(0, max(1, lengths["points"]), max_points):
-            yield _npz_piece({name: c.read(max_points) for name, c in columns.items()}, origins)
+            yield _npz_piece({name: c.read(max_points) for name, c in columns.items()}, *scans)
 
 
-def _npz_piece(columns: dict[str, NDArray], origins: NDArray | None) -> Readout:
+def _npz_piece(
+    columns: dict[str, NDArray], origins: NDArray | None, scan_times: NDArray | None
+) -> Readout:
     """Rows of the arrays as rays."""
     scan_id, is_return = columns.get("scan_id"), columns.get("is_return")
     target_index = columns.get("target_index")
@@ -74,6 +77,7 @@ def _npz_piece(columns: dict[str, NDArray], origins: NDArray | None) -> Readout:
         None if target_index is None else _integers(target_index, "target_index", 1),
         origin_cure="Add an array origins (S, D)",
         channels=_channels_of(columns),
+        scan_times=scan_times,
     )
 
 
@@ -174,17 +178,21 @@ def _points_of(archive: zipfile.ZipFile) -> NDArray[np.float64]:
     return _coordinates(points, "points")
 
 
-def _origins_of(archive: zipfile.ZipFile, has_scan_id: bool) -> NDArray[np.float64] | None:
-    """(S, D) sensor positions; None where there are none."""
-    origins = _optional(archive, "origins")
+def _scans_of(
+    archive: zipfile.ZipFile, has_scan_id: bool
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """(S, D) sensor positions and (S,) time stamps; None where there are none."""
+    origins, times = _optional(archive, "origins"), _optional(archive, "scan_times")
     if origins is None:
-        return None
+        return None, None
     if not has_scan_id and len(origins) != 1:
         raise ValueError(f"scan_id is needed to choose among {len(origins)} origins; got none")
     origins = _coordinates(origins, "origins")
     if not np.isfinite(origins).all():
         raise ValueError(f"origins must be finite; got {origins.tolist()[:3]}")
-    return origins
+    if times is not None and times.shape != (len(origins),):
+        raise ValueError(f"scan_times must be ({len(origins)},), one per origin; got {times.shape}")
+    return origins, None if times is None else times.astype(np.float64)
 
 
 def _checked_entry(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
@@ -192,7 +200,7 @@ def _checked_entry(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
     entry = archive.getinfo(f"{name}.npy")
     held = min(entry.compress_size, os.path.getsize(str(archive.filename)) - entry.header_offset)
     if entry.compress_size > held or entry.file_size > _DEFLATE_RATIO * held + 1024:
-        raise ValueError(f"{name} promises {entry.file_size} bytes; {held} cannot hold them")
+        raise ValueError(f"{name} declares {entry.file_size} bytes; {held} cannot hold them")
     return entry
 
 

@@ -47,16 +47,16 @@ class PlainMap(nn.Module):
 
 @reads_map
 def save_onnx(model: OccupancyMap, path: str | os.PathLike[str]) -> None:
-    """Write what `model(points)` computes as an ONNX model of opset 18.
+    """Export `model(points)` as an ONNX model of opset 18.
 
-    Its input ``points`` (N, D) has world positions [m] in float64, for any N from 1 on. Its output
-    ``probability`` (N,) has the dtype of the map, float32 at least. The model holds no search index:
-    it computes the distance from every point to every cluster, so time and memory grow with N times
+    The input ``points`` (N, D) are world positions [m] in float64, with N >= 1. The output
+    ``probability`` (N,) has the dtype of the map, at least float32. The model has no search index and
+    computes the distance from every point to every cluster, so time and memory grow with N times
     the number of clusters. Channels, classes and the posterior of the weights are not exported.
 
     Args:
         model: a map with at least one cluster.
-        path: the file; an old one is replaced.
+        path: the file to write; an existing file is replaced.
 
     Raises:
         ImportError: the libraries onnx and onnxscript are not installed.

@@ -1,4 +1,4 @@
-"""Where the sensor of each scan stood: known from the file, given by the caller, or refused."""
+"""Sensor position of each scan: from the file or from the caller; otherwise an error."""
 
 from __future__ import annotations
 
@@ -45,12 +45,14 @@ def with_origins(
     wrong = _why_placeholder_is_wrong(readout, file, num_placeholders)
     if wrong:
         raise ValueError(
-            f"{file} must say where the sensor stood. Its pose is the identity, which is what "
-            f"writers put when they know none, and {wrong}. {readout.origin_cure} or give it: "
+            f"{file} must contain the sensor position. Its pose is the identity, which many programs "
+            f"write if they have no pose, and {wrong}. {readout.origin_cure} or give it: "
             f"{_GIVE_IT}.{_hint(file)}"
         )
     zero = ",".join("0" * readout.dim)
-    note = Note("identity pose taken for a sensor at zero", cure=f"--origin {zero} confirms it")
+    note = Note(
+        "identity pose assumed to be that of a sensor at zero", cure=f"--origin {zero} confirms it"
+    )
     return seen_beams(replace(readout, origin_is_placeholder=False)).noting(note)
 
 
@@ -67,9 +69,9 @@ def with_identities(readout: Readout, is_identity: NDArray[np.bool_]) -> Readout
     is_one = int(is_identity.sum()) == 1
     ends = readout.ends if readout.scan_id is None else readout.ends[readout.scan_id == scan]
     if is_one and _nearest(ends) <= FARTHEST_START:
-        cure = "the scan that the others are registered to; else export it with its pose"
+        cure = "if the others are registered to this scan; else export it with its pose"
         return readout.noting(
-            Note(f"the identity pose of scan {scan} is taken for its own", cure=cure)
+            Note(f"the identity pose of scan {scan} is assumed to be valid", cure=cure)
         )
     return replace(readout, origins=np.where(is_identity[:, None], np.nan, readout.origins))
 
@@ -93,7 +95,7 @@ def _unknown(readout: Readout, file: Path) -> ValueError:
         missing = np.flatnonzero(np.isnan(readout.origins).any(axis=1))
         which = f" for {len(missing)} of {readout.num_scans} scans, the first of them {missing[0]}"
     return ValueError(
-        f"{file} must say where the sensor stood, and it does not{which}. {readout.origin_cure} or "
+        f"{file} must contain the sensor position; it does not{which}. {readout.origin_cure} or "
         f"give it: {_GIVE_IT}.{_hint(file)}"
     )
 
@@ -154,6 +156,7 @@ def scans_from(readout: Readout, file: Path) -> Scans:
         "scan_id": readout.scan_id,
         "is_return": readout.is_return,
         "target_index": readout.target_index,
+        "times": readout.scan_times,
     }
     known = {name: torch.from_numpy(v) for name, v in columns.items() if v is not None}
     channels = {name: torch.from_numpy(v) for name, v in readout.channels.items()}

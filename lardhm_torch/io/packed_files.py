@@ -304,5 +304,5 @@ def load_packed(path: str | os.PathLike[str]) -> tuple[int, Packed]:
         if found is None:
             raise ValueError("there is no packet")
     except ValueError as error:
-        raise ValueError(f"{os.fspath(path)} must be a packed map, whole; {error}") from error
+        raise ValueError(f"{os.fspath(path)} must be a complete packed map; {error}") from error
     return found

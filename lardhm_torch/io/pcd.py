@@ -1,11 +1,11 @@
-"""PCD: ascii, binary and binary_compressed; VIEWPOINT is where the sensor stood.
+"""PCD: ascii, binary and binary_compressed; VIEWPOINT is the sensor pose.
 
 Files do not state whether VIEWPOINT is the viewpoint of points in the world frame (la3dm) or the
 transform of points in the sensor frame (CloudCompare). ``frame="world"`` or
-``frame="sensor"`` decides; without it a VIEWPOINT that only shifts is taken for a viewpoint, and one
-that rotates is refused (`frames.placed`). VIEWPOINT 0 0 0 1 0 0 0 is what PCL, Open3D and pypcd4
-write when they know no pose. A field ``is_return`` says which beams met nothing; else points of NaN
-in an organized cloud are such beams, if its grid is one of angles (`no_returns.with_free_beams`).
+``frame="sensor"`` decides; without it a VIEWPOINT without rotation is assumed to be a viewpoint, and one
+with a rotation is refused (`frames.placed`). PCL, Open3D and pypcd4 write VIEWPOINT 0 0 0 1 0 0 0 if they
+have no pose. A field ``is_return`` marks beams without return; otherwise points of NaN in an organized
+cloud are such beams, if its grid is one of angles (`no_returns.with_free_beams`).
 """
 
 from __future__ import annotations
@@ -207,11 +207,11 @@ def _read_compressed(file: BinaryIO, header: _Header) -> Columns:
     packed, unpacked = int.from_bytes(sizes[:4], "little"), int.from_bytes(sizes[4:], "little")
     promised = header.count * record_size(header.fields)
     if len(sizes) < 8 or packed > bytes_left(file):
-        raise ValueError(f"{packed} compressed bytes are promised; got {bytes_left(file)}")
+        raise ValueError(f"{packed} compressed bytes are declared; got {bytes_left(file)}")
     if unpacked != promised or unpacked > _LZF_RATIO * packed:
         raise ValueError(
             f"{header.count} points need {promised} bytes; "
-            f"the file promises {unpacked} from {packed} compressed ones"
+            f"the file declares {unpacked} from {packed} compressed ones"
         )
     content, columns, offset = decompress_lzf(file.read(packed), unpacked), {}, 0
     for field in header.fields:

@@ -36,7 +36,7 @@ def read_ascii_lists(file: BinaryIO, fields: Sequence[Field | ListField], count:
     """
     columns: dict[str, list[float]] = {name: [] for name in _wanted(fields)}
     if count > bytes_left(file):
-        raise ValueError(f"{count} records are promised; got {bytes_left(file)} bytes")
+        raise ValueError(f"{count} records are declared; got {bytes_left(file)} bytes")
     for number in range(count):
         words, at = file.readline().split(), 0
         try:
@@ -60,7 +60,7 @@ def read_binary_lists(file: BinaryIO, fields: Sequence[Field | ListField], count
     """
     names = _wanted(fields)
     if count * max(1, sum(field.num_bytes for field in fields)) > bytes_left(file):
-        raise ValueError(f"{count} records are promised; got {bytes_left(file)} bytes")
+        raise ValueError(f"{count} records are declared; got {bytes_left(file)} bytes")
     start, content, at = file.tell(), file.read(), 0
     wanted = {name: np.empty(count) for name in names}
     same = _equal_records(content, fields, count)

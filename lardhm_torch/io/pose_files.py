@@ -191,7 +191,7 @@ def _tum(
     if named is not None and named["qw"] < named["qx"]:
         notes += (Note(f"quaternions of {path.name} are w x y z, by its comment"),)
     elif named is None and abs(rows[is_pose][0, 4:]).tolist() == [1, 0, 0, 0]:
-        cure = "a comment '# stamp tx ty tz qw qx qy qz' says that qw is first"
+        cure = "a comment '# stamp tx ty tz qw qx qy qz' states that qw is first"
         text = f"the first quaternion of {path.name} is 1 0 0 0, read as x y z w: a half turn"
         notes += (Note(text, cure=cure, is_loss=True),)
     return PoseFile(poses, stamps, notes=notes)

@@ -175,7 +175,7 @@ def _by_line(file: PoseFile) -> Note:
     """The note for lines that were found by number."""
     steps = np.empty(0) if file.stamps is None else np.diff(file.stamps[np.isfinite(file.stamps)])
     if len(steps) > 1 and steps.max() > 2.5 * np.median(steps) and steps.min() > 0:
-        cure = "scans named by stamp settle it"
+        cure = "scans named by stamp avoid it"
         return Note("poses by line number (from 0), though stamps have a gap", cure=cure)
     return Note("poses by line number (from 0)")
 
@@ -239,28 +239,28 @@ def _of_lidar(
         if tr is None:
             where = calibs[0] if calibs else source.with_name("calib.txt")
             raise ValueError(
-                f"{source} holds poses of the camera; {where} must say how the lidar is mounted, in "
+                f"{source} holds poses of the camera; {where} must give the pose of the lidar, in "
                 'a line Tr: of 12 numbers. If they are the lidar\'s: poses_frame="lidar", '
                 "--poses-frame lidar on the command line"
             )
         moved = np.linalg.inv(tr) @ file.poses @ tr
         return PoseFile(moved, file.stamps, file.numbers), _camera_notes(file, tr, poses_frame)
     cure = "poses_frame='lidar' confirms it, poses_frame='camera' uses Tr of calib.txt"
-    note = Note("poses taken to be the lidar's", cure=cure, is_loss=_rises(file.poses))
+    note = Note("poses assumed to be the lidar's", cure=cure, is_loss=_rises(file.poses))
     return file, (note,)
 
 
 def _camera_notes(
     file: PoseFile, camera_from_lidar: NDArray[np.float64], poses_frame: str | None
 ) -> tuple[Note, ...]:
-    """The notes for poses taken to be the camera's, which not all programs write."""
+    """The notes for poses assumed to be the camera's, which not all programs write."""
     if poses_frame == "camera":
-        return (Note("poses of the camera, as given, moved to the lidar by Tr"),)
+        return (Note("poses of the camera, as given, transformed to the lidar by Tr"),)
     moves = _moves_along(file.poses)
     as_lidar = np.abs(moves)
     as_camera = np.abs(camera_from_lidar[:3, :3].T @ moves)
     is_doubtful = as_lidar[0] > 0.7 and as_camera[0] < 0.7
-    text = "poses taken to be the camera's, as KITTI publishes them, and moved to the lidar by Tr"
+    text = "poses assumed to be the camera's, as KITTI publishes them, and transformed to the lidar by Tr"
     if is_doubtful:
         text += "; they would move it sideways or up"
     cure = "poses_frame='camera' confirms it, poses_frame='lidar' if they are the lidar's"
@@ -294,5 +294,5 @@ def _of_vehicle(
             'they are the lidar\'s: poses_frame="lidar", --poses-frame lidar on the command line'
         )
     cure = "poses_frame='lidar' if they are the lidar's"
-    note = Note("poses taken to be the vehicle's, as KITTI-360 publishes them", cure=cure)
+    note = Note("poses assumed to be the vehicle's, as KITTI-360 publishes them", cure=cure)
     return PoseFile(file.poses @ mount, None, file.numbers), (note,)

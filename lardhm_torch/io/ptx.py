@@ -107,14 +107,14 @@ def _next_scan(file: TextIO, size: int) -> _Scan | None:
     shape = tuple(header_count(" ".join(words), "columns and rows") for words in lines[:2])
     count = shape[0] * shape[1]
     if count * _LEAST_BYTES > size:
-        raise ValueError(f"{count} points are promised; {size} bytes are too few")
+        raise ValueError(f"{count} points are declared; {size} bytes are too few")
     points = np.empty((0, 3))
     if count:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # no line left: counted below
             points = np.loadtxt(file, usecols=(0, 1, 2), max_rows=count, comments=None, ndmin=2)
     if len(points) != count:
-        raise ValueError(f"{count} points are promised; got {len(points)} lines")
+        raise ValueError(f"{count} points are declared; got {len(points)} lines")
     pose, shift = _pose(lines[2:])
     return _Scan(np.where((points == 0).all(1)[:, None], 0, points - shift), shape, pose)  # type: ignore[arg-type]
 

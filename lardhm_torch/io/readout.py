@@ -1,4 +1,4 @@
-"""What a reader found in a file, before it is known whether it is complete."""
+"""The contents of a scan file, before they are known to be complete."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ class Readout:
         times: (R,) float64 when each ray was measured [s], in the clock of the file.
         grid: rows and columns of an organized cloud, whose rays come row by row.
         channels: (R, ...) values of the rays by name, see `lardhm_torch.channels`.
+        scan_times: (S,) float64 time stamp of each scan [s].
     """
 
     ends: NDArray[np.float64]
@@ -48,6 +49,7 @@ class Readout:
     times: NDArray[np.float64] | None = None
     grid: tuple[int, int] | None = None
     channels: Mapping[str, NDArray] = field(default_factory=dict)
+    scan_times: NDArray[np.float64] | None = None
 
     def noting(self, *notes: Note) -> Readout:
         """The same with more notes."""

@@ -76,7 +76,7 @@ def read_binary(
     size = record_size(fields)
     if count * size > bytes_left(file):
         raise ValueError(
-            f"{count} points of {size} bytes are promised, {count * size} bytes; "
+            f"{count} points of {size} bytes are declared, {count * size} bytes; "
             f"got {bytes_left(file)}"
         )
     wanted, offset = {}, 0
@@ -105,7 +105,7 @@ def read_ascii(
     shortest = 2 * sum(field.count for field in fields)  # a digit and a separator each
     if count * shortest > left + 1:
         raise ValueError(
-            f"{count} points of {shortest // 2} numbers are promised; {left} bytes are too few"
+            f"{count} points of {shortest // 2} numbers are declared; {left} bytes are too few"
         )
     wanted, column = {}, 0
     for field in fields:
@@ -116,7 +116,7 @@ def read_ascii(
         return {name: np.empty(count) for name in wanted}
     table = read_table(path, skip_lines, list(wanted.values()), max_rows=count, comments=None)
     if len(table) != count:
-        raise ValueError(f"{count} points are promised; got {len(table)} lines")
+        raise ValueError(f"{count} points are declared; got {len(table)} lines")
     types = {field.name: np.dtype(field.format) for field in fields if field.name in wanted}
     return {
         name: table[:, i].astype(column_type(name, types[name])) for i, name in enumerate(wanted)

@@ -32,12 +32,12 @@ _NO_DEPTH = (0, 65535)
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """Camera of a folder of depth images, where the folder does not contain it.
+    """Settings of the camera of a folder of depth images.
 
     Args:
         intrinsics: fx, fy, cx, cy of the pinhole [pixels], lens distortion removed; None: a file
             camera-intrinsics.txt beside the images.
-        pixel_step: every how many pixels of a row and of a column are read; 1: all of them.
+        pixel_step: step between the rows and columns that are read; 1: read all pixels.
         depth_scale: units of the images per meter; None: 1000 in the 7-Scenes layout, 5000 in
             TUM's.
     """
@@ -62,6 +62,7 @@ class _Frame:
     image: Path
     pose: NDArray[np.float64]  # (4, 4) world_from_camera
     color: Path | None = None
+    stamp: float = math.nan  # [s]
 
 
 def is_rgbd_folder(folder: Path) -> bool:
@@ -82,7 +83,7 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
     A pixel of depth 0 or 65535 has none. Images without a pose are left out, with a warning. A
     negative fy means that y points up in the images' poses (ICL-NUIM).
 
-    Color images of the same size are taken as registered to the depth images, pixel by pixel:
+    Color images of the same size are assumed to be registered to the depth images, pixel by pixel:
     frame-000000.color.png or .jpg; of TUM those that rgb.txt or the pairs of the list name.
 
     Raises:
@@ -115,13 +116,16 @@ def read_rgbd(folder: Path, camera: Camera) -> Readout:
             *_color_notes(frames, sum(map(bool, channels))),
         ),
         channels=joined_columns(list(zip(channels, counts, strict=True))),
+        scan_times=None if image_list is None else np.array([frame.stamp for frame in frames]),
     )
 
 
 def _color_notes(frames: list[_Frame], used: int) -> list[Note]:
     """What was assumed of the color images, and that the others are not used."""
     unused = sum(frame.color is not None for frame in frames) - used
-    notes = [Note("color images taken as registered to the depth images", used)] if used else []
+    notes = (
+        [Note("color images assumed to be registered to the depth images", used)] if used else []
+    )
     if unused:
         notes.append(
             Note("color images of another size than the depth images are left out", unused)
@@ -189,8 +193,8 @@ def _tum_frames(folder: Path, image_list: Path) -> tuple[list[_Frame], int]:
     found, gaps = poses.at(np.array(stamps))
     colors = [a or b for a, b in zip(paired, listed_colors(folder, stamps), strict=True)]
     frames = [
-        _Frame(image, pose, color if color is not None and color.is_file() else None)
-        for image, pose, gap, color in zip(images, found, gaps, colors, strict=True)
+        _Frame(image, pose, color if color is not None and color.is_file() else None, stamp)
+        for image, pose, gap, color, stamp in zip(images, found, gaps, colors, stamps, strict=True)
         if gap <= MAX_STAMP_GAP
     ]
     return frames, len(images) - len(frames)
@@ -285,7 +289,7 @@ def _read_depth(path: Path) -> NDArray[np.float64]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            # From memory: of a file Pillow would allocate whatever length a broken chunk promises.
+            # From memory: of a file Pillow would allocate whatever length a broken chunk declares.
             image = Image.open(BytesIO(path.read_bytes()), formats=["PNG"])
         with image:
             if image.width * image.height > _MAX_PIXELS or not image.mode.startswith("I"):

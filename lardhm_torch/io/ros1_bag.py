@@ -46,7 +46,7 @@ def read_ros1(file: BinaryIO, unpack: Unpacker) -> Iterator[Message]:
             yield from _ros1_message(bag, header, body)
     if (bag.num_chunks, bag.num_connections) != (chunks, promised):
         raise ValueError(
-            f"{chunks} chunks and {promised} connections are promised; "
+            f"{chunks} chunks and {promised} connections are declared; "
             f"got {bag.num_chunks} and {bag.num_connections}"
         )
 

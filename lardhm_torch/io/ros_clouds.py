@@ -54,7 +54,7 @@ def read_cloud(message: Message, decode: Any) -> Cloud:
     Points at exactly 0 0 0 are how drivers write "no return": they are left out and counted.
 
     Raises:
-        ValueError: the message promises more than it holds.
+        ValueError: the message declares more than it holds.
     """
     seconds, channels = 1e-9 * message.recorded, dict[str, NDArray]()
     if message.kind.endswith("/CustomMsg"):
@@ -153,7 +153,7 @@ def _row_step(cloud: Any) -> int:
 
 def _too_short(cloud: Any) -> ValueError:
     return ValueError(
-        f"a cloud promises {cloud.height} x {cloud.width} points of {cloud.point_step} bytes; "
+        f"a cloud declares {cloud.height} x {cloud.width} points of {cloud.point_step} bytes; "
         f"got {len(cloud.data)} bytes"
     )
 
@@ -177,7 +177,7 @@ def _livox_points(message: Message) -> tuple[float, str, NDArray[np.float64]]:
     kind = np.dtype(_LIVOX_POINT).newbyteorder("<")
     size = kind.itemsize if message.is_ros1 else kind.itemsize + 1
     if count * size - (size - kind.itemsize) > len(content) - at:
-        raise ValueError(f"a cloud promises {count} points; got {len(content) - at} bytes")
+        raise ValueError(f"a cloud declares {count} points; got {len(content) - at} bytes")
     points = np.ndarray(count, kind, content, at, (size,)) if count else np.empty(0, kind)
     stamp = seconds + 1e-9 * nanoseconds
     return stamp, frame_name(frame), points["xyz"].astype(np.float64).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Files to Scans and back: one file, several, or a folder; the reader follows from the extension.
+"""Read and write scan files: one file, several, or a folder. The extension selects the reader.
 
 | extension | coordinates | sensor position |
 |---|---|---|
@@ -14,22 +14,22 @@
 | ``.bag .db3 .mcap``, folder of a ROS 2 bag | clouds and laser scans | tf, or a topic of poses |
 | folder of depth images (7-Scenes, TUM) | 16-bit depth, camera frame | pose files |
 
-Poses are a file poses.txt, groundtruth.txt or trajectory.txt beside the scans or one folder up,
-each line in KITTI's, KITTI-360's or TUM's format (`poses.pose_beside`). Whether the points of a
-PLY, PCD, text or LAS file lie in the world or still in the sensor's frame, no file says: the world
-is assumed, ``frame="sensor"`` says the other. The rest is in the readers' docstrings.
+Poses are read from a file poses.txt, groundtruth.txt or trajectory.txt in the folder of the scans or
+one folder up, with lines in the format of KITTI, KITTI-360 or TUM (`poses.pose_beside`). PLY, PCD,
+text and LAS files do not state whether their points are in the world frame or in the sensor frame.
+The world frame is assumed; ``frame="sensor"`` selects the other. The readers' docstrings give details.
 
-Coordinates are float64 from the file on, so UTM loses nothing. Columns named scan_id, is_return
-and target_index (or return_number) are read where a format has named columns. Points that are NaN
-are kept: sampling drops and counts them. Points at exactly zero are left out and counted: they mark
-beams without return. What was assumed is in a `notes.ScanReport`; docs/formats.md has the table.
+Coordinates are read as float64, so UTM coordinates are exact. Columns named scan_id, is_return
+and target_index (or return_number) are read if a format has named columns. Points that are NaN
+are kept: sampling drops and counts them. Points at exactly zero mark beams without return; they are
+left out and counted. A `notes.ScanReport` lists all assumptions; docs/formats.md has a table.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -92,7 +92,7 @@ _FOLDER_KINDS = {"a ROS 2 bag": is_bag_folder, "a folder of depth images": is_rg
 
 @dataclass(frozen=True)
 class Reading:
-    """How the caller wants files to be read: the options of `load_scans`, which explains them."""
+    """Options for reading files; see `load_scans`."""
 
     origin: Sequence[float] | None = None
     frame: str | None = None
@@ -136,26 +136,26 @@ def load_scans(
     strict: bool = False,
     report: ScanReport | None = None,
 ) -> Scans:
-    """The scans of one file, of several, or of all scan files of a folder, in order.
+    """Read the scans of one file, of several files, or of all scan files of a folder, in order.
 
-    Each file is one scan, unless it tells its scans apart itself. A folder is read in natural
+    Each file is one scan, unless its format distinguishes several scans. A folder is read in natural
     order (scan_10 after scan_9), without its subfolders; the folder of a ROS 2 bag or of depth
-    images is read as one.
+    images is read as one unit.
 
     Args:
         path: a file, a folder, or several of them.
-        origin: (D,) sensor position in the world [m] for scans that carry none. It also takes the
-            place of a VIEWPOINT or pose at zero, which writers put when they know none.
-        frame: what the points of PLY, PCD, text and LAS files are in. "sensor": the pose of each
-            file (a pose file's, or VIEWPOINT) moves them into the world; "world": a pose file only
-            says where the sensor stood; None: as "world", but pose files are not looked for.
-        poses_frame: whose poses a pose file holds, "camera" or "lidar"; of a bag, the frame of tf
-            whose poses the topic of poses holds, if it does not say so.
-        sensor_frame: of a bag, the frame of the sensor where clouds are in another one.
-        topic: of a bag's clouds, of its poses, or both; needed if there are several.
-        camera: of a folder of depth images.
-        strict: refuse whatever would have to be guessed.
-        report: filled with what was read and what was assumed.
+        origin: (D,) sensor position [m] for scans that do not contain one. It also replaces a
+            VIEWPOINT or pose at zero, which programs write if they do not know the pose.
+        frame: frame of the points of PLY, PCD, text and LAS files. "sensor": points are transformed by
+            the pose of each file (from a pose file, or VIEWPOINT); "world": a pose file only gives the
+            sensor positions; None: as "world", but pose files are ignored.
+        poses_frame: whose poses a pose file contains, "camera" or "lidar"; for a bag, the tf frame of
+            the pose topic, if its messages do not name it.
+        sensor_frame: for a bag, the frame of the sensor if clouds are in another frame.
+        topic: topic of a bag's clouds or poses, or both; required if there are several.
+        camera: settings for a folder of depth images.
+        strict: raise an error instead of guessing.
+        report: receives the contents of the files and the assumptions.
 
     Returns:
         All scans, world frame.
@@ -203,9 +203,9 @@ def iter_scans(
 ) -> Iterator[Scans]:
     """Read the scans of `load_scans` one at a time.
 
-    Each file is read when it is needed, so that a folder of any length needs the memory of one file.
-    The rays of a moving sensor (LAS with a trajectory by GPS time), each with an origin of its own,
-    come in packets of 32,768 in the order of time.
+    Each file is read when it is needed, so a folder of any length needs the memory of one file.
+    The rays of a moving sensor (LAS with a trajectory by GPS time) each have their own origin; they
+    are returned in packets of 32,768 in the order of time.
 
     Args:
         path: a file, a folder, or several of them.
@@ -223,7 +223,7 @@ def iter_scans(
 
     Raises:
         FileNotFoundError, ValueError, ImportError: see `load_scans`; raised when the file is read.
-            That no file needs the origin given is raised at the end, unless there is one file only.
+            If no file needs the given origin, the error is raised at the end (with one file, at once).
     """
     reading = Reading(origin, frame, poses_frame, sensor_frame, topic, camera, strict, report)
     for scans, moves in _scans_of_each_file(path, reading, max_rays=None):
@@ -235,7 +235,7 @@ def iter_scans(
                 used, scan_id = scan.scan_id.unique(return_inverse=True)
             else:
                 used, scan_id = torch.tensor([number]), torch.zeros_like(scan.scan_id)
-            yield replace(scan, origins=scans.origins[used], scan_id=scan_id)
+            yield scan.with_origins(used, scan_id)
 
 
 def iter_pieces(
@@ -307,11 +307,11 @@ def load_points(path: PathLike) -> Tensor:
         path: the file.
 
     Returns:
-        (N, D) float64 positions [m]; of a scan file the hits: beams without return have no point.
+        (N, D) float64 positions [m]; for a scan file, those of the hits.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file cannot be read, or holds no (N, D) array of numbers.
+        ValueError: the file cannot be read, or does not contain an (N, D) array of numbers.
         ImportError: the file needs an optional library.
     """
     file = Path(path)

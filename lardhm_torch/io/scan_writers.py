@@ -115,7 +115,8 @@ WRITERS: dict[str, Callable[[Path, Columns], None]] = {".ply": write_ply, ".pcd"
 def save_scans(scans: Scans, path: str | os.PathLike[str]) -> None:
     """Write scans with their channels as ``.npz``, or as the points of ``.ply`` or ``.pcd``, atomically.
 
-    `load_scans` reads all three back. Scans without rays have no point, and are lost in .ply and .pcd.
+    `load_scans` reads all three formats. Scans without rays are lost in .ply and .pcd, because they
+    have no points.
 
     Args:
         scans: range scans, world frame.
@@ -141,6 +142,8 @@ def save_scans(scans: Scans, path: str | os.PathLike[str]) -> None:
     arrays = {name: value.detach().cpu().numpy() for name, value in columns.items()}
     channels = {name: value.cpu().numpy() for name, value in scans.channels.items()}
     if suffix == ".npz":
+        if scans.times is not None:
+            arrays["scan_times"] = scans.times.cpu().numpy()
         write_npz(target, arrays, channels)
     else:
         WRITERS[suffix](target, ray_columns(arrays, channels))

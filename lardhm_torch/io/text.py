@@ -106,7 +106,7 @@ def _layout_of(lines: list[str], suffix: str) -> _Layout:
         names = ["x", "y", "z"][:width]
         if width > 3 and suffix not in (".xyz", ".pts"):
             cure = "name the columns in the first line"
-            notes = (Note("first three columns taken for x y z", cure=cure),)
+            notes = (Note("first three columns assumed to be x y z", cure=cure),)
     return _Layout(_delimiter(row), names, skip_lines, count, notes)
 
 
@@ -119,21 +119,21 @@ def _read_counted(path: Path, layout: _Layout, wanted: dict[str, int]) -> Readou
             file.readline()
         while count is not None:
             if 4 * count > size:  # "0 0" and a line break
-                raise ValueError(f"{count} points are promised; {size} bytes are too few")
+                raise ValueError(f"{count} points are declared; {size} bytes are too few")
             columns = list(wanted.values())
             table = read_table(file, 0, columns, delimiter=layout.delimiter, max_rows=count)
             if len(table) != count:
-                raise ValueError(f"{count} points are promised; got {len(table)} lines")
+                raise ValueError(f"{count} points are declared; got {len(table)} lines")
             tables.append(table)
             line = next((text for text in iter(file.readline, "") if text.strip()), "")
             if line and not _is_count(line.strip()):
-                raise ValueError(f"{count} points are promised; more lines follow: {line[:40]!r}")
+                raise ValueError(f"{count} points are declared; more lines follow: {line[:40]!r}")
             count = int(line) if line else None
     table = np.concatenate(tables)
     readout = readout_from_columns({name: table[:, i] for i, name in enumerate(wanted)})
     if len(tables) == 1 or readout.scan_id is not None:
         return readout
-    note = Note("tables of points, each taken for a scan", len(tables))
+    note = Note("tables of points, each read as a scan", len(tables))
     scan_id = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
     return Readout(readout.ends, scan_id=scan_id, notes=(note,), channels=readout.channels)
 

@@ -19,7 +19,7 @@ def kernels_near(
     Args:
         centers: (M, D) cluster centers [m].
         raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
-        kernel: covariance scale and minimum length-scale.
+        kernel: covariance scale and minimum length scale.
         points: (N, D) positions [m], at least one, finite.
         stds: half-width of the bounding box of a kernel, in its standard deviations.
 
@@ -71,7 +71,7 @@ def feature_sums(
         centers: (M, D) cluster centers [m].
         raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
         wanted: (M,) bool.
-        kernel: k, covariance scale and minimum length-scale.
+        kernel: k, covariance scale and minimum length scale.
         index: search index of the centers, see `native.build_index`.
     """
     if native.supports(points):
@@ -100,7 +100,7 @@ def ordered_features(
         order: (N,) permutation of the rows.
         centers: (M, D) cluster centers [m].
         raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
-        kernel: k, covariance scale and minimum length-scale.
+        kernel: k, covariance scale and minimum length scale.
         index: search index of the centers, see `native.build_index`.
     """
     if native.supports(points):

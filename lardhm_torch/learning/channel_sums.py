@@ -235,6 +235,12 @@ def with_layout(
     return replace(state, channel_sums=sums, class_weights=weights)
 
 
+def with_layout_of(hits: Hits, state: MapState, before: Layout) -> tuple[MapState, Layout]:
+    """Clusters in a layout that also has the channels of the hits, and that layout."""
+    layout = joint_layout(before, layout_of(hits.channels))
+    return with_layout(state, before, layout), layout
+
+
 def with_hits(state: MapState, layout: Layout, hits: Hits) -> MapState:
     """The clusters with the values of more hits, each added to the occupied cluster of nearest mean.
 

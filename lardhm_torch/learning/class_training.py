@@ -1,9 +1,9 @@
-"""Multi-class Hilbert maps: clusters of labelled points of any kind, and weights of the classes.
+"""Multi-class Hilbert maps: clusters of labeled points of any kind, and weights of the classes.
 
 The log-odds of class k are those of the class counts around a point plus sum_m phi_m(x) V_mk. The class
-weights V (M, K) minimize the multinomial log-loss as the weights of the occupancy minimize the binary
-one; the paper names this extension in its footnote 1. They begin at 0, so that a map without training
-answers by its counts.
+weights V (M, K) minimize the multinomial log-loss, as the weights of the occupancy minimize the binary
+one; the paper mentions this extension in its footnote 1. They are 0 before training, when the class
+counts alone determine the result.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def check_class_points(points: TensorLike, classes: TensorLike, like: Tensor) ->
     rows = (~missing(values)).nonzero().squeeze(1)
     if len(points) and len(rows) == 0:
         raise ValueError(
-            f"classes must have a value for a point at least; all {len(points)} miss it"
+            f"classes must have a value for at least one point; all {len(points)} are missing"
         )
     points, _ = check_samples(points, torch.ones(len(points)), like.shape[1], like.device)
     return ClassPoints(*in_morton_order(points[rows], values[rows]))
@@ -99,7 +99,7 @@ def clustered(
     Args:
         labelled: N points; one with probabilities belongs to its most likely class.
         num_clusters: total, divided in proportion to the points; None: one per 30 points of a class.
-        kernel: minimum length-scale.
+        kernel: minimum length scale.
         like: (M, D) tensor of the map.
         rng: random generator.
 

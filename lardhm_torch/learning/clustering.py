@@ -104,7 +104,7 @@ def cluster_classes(
     num_clusters: int | Sequence[int] | None,
     rng: torch.Generator,
 ) -> tuple[Clusters, Tensor]:
-    """Cluster occupied and free points separately, which works better (paper, Section II-B).
+    """Cluster occupied, free and unknown points separately, as the paper does (Section II-B).
 
     Args:
         points: (N, D) positions [m], in the order of `morton_order`.
@@ -231,8 +231,9 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False, represented: int 
     observed surface. It is bounded so that clusters have at least `POINTS_PER_CLUSTER` points on
     average, because accuracy drops with fewer (paper, Section IV-B), and at most `DENSE_POINTS`. Up
     to `FEW_POINTS` points in different cells may have a cluster each, because a cluster of hits that
-    are far apart would extend across the room. The free class gets as many clusters: the number of
-    free points depends on the sampler, not on the scene.
+    are far apart would extend across the room. The numbers for the free and unknown classes follow
+    from it (`class_ratios`), because the number of free points depends on the sampler, not on the
+    scene.
 
     Args:
         points: (N, D) positions [m].

@@ -1,9 +1,9 @@
-"""Joint optimization of length-scales, centers and weights by backpropagation."""
+"""Joint optimization of length scales, centers and weights by backpropagation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -18,8 +18,8 @@ from lardhm_torch.learning.fitting import (
     logistic_loss,
     stratified_batches,
 )
-from lardhm_torch.learning.parameters import MapParameters
-from lardhm_torch.learning.points import as_tensor, check_samples, in_morton_order, to_map_frame
+from lardhm_torch.learning.parameters import MapParameters, read_state
+from lardhm_torch.learning.points import check_samples, in_morton_order, to_map_frame
 from lardhm_torch.learning.tuning_steps import (
     Batches,
     Moving,
@@ -29,6 +29,7 @@ from lardhm_torch.learning.tuning_steps import (
     to_rows,
     tuning_steps,
 )
+from lardhm_torch.learning.unseen import settle_unknown
 from lardhm_torch.sampling import UNKNOWN, Samples
 from lardhm_torch.scans import seeded_generator
 
@@ -52,21 +53,22 @@ def fine_tune(
     progress: bool = False,
     config: TuneConfig | None = None,
 ) -> list[float]:
-    """Optimize centers, length-scales and weights of a fitted map on the balanced log-loss.
+    """Optimize centers, length scales and weights of a fitted map on the balanced log-loss.
 
     The optimizer is Adam with a short warm-up and a linear decay of the learning rates to 0. Offsets
-    of centers are in units of the mean length-scale of their cluster, and the diagonals of factors
+    of centers are in units of the mean length scale of their cluster, and the diagonals of factors
     are optimized as logarithms. Learning rates are therefore independent of the scene, and every
-    factor remains valid. In each epoch the neighbors are searched once and the points passed several
-    times, in groups, so that memory for neighbors does not grow with the number of points. With
-    ``hold_out``, a fraction of the rays is excluded from training, and the parameters of the epoch
-    with the smallest loss on them are kept. The initial map is not a candidate, because `fit` has
-    used those rays. If anything fails, the map is unchanged.
+    factor remains valid. In each epoch the neighbors are searched once, and several passes over the
+    points are made in groups, so that the memory for neighbors does not grow with the number of
+    points. With ``hold_out``, a fraction of the rays is excluded from training, and the parameters of
+    the epoch with the smallest loss on them are kept. The initial map is not a candidate, because
+    `fit` has used those rays. If anything fails, the map is unchanged.
 
     Args:
         model: a fitted map, changed in place.
         points: (N, D) world positions [m].
-        labels: (N,) 1 occupied, 0 free; unknown points (1/2) are left out.
+        labels: (N,) 1 occupied, 0 free, 1/2 unknown. If there are unknown points, more are drawn in the
+            tails of the kernels in every epoch, as in `fit`, so kernels do not extend into unknown space.
         ray_id: (N,) ray of each point, so that complete rays are held out (`Samples.ray_id`);
             None: points are held out individually.
         resample: function that returns new samples of the same rays, given the number of the epoch
@@ -89,7 +91,8 @@ def fine_tune(
     """
     config = config or TuneConfig()
     _check_task(model, config, resample is not None and ray_id is None)
-    samples = _check(model, points, labels, ray_id)
+    with_unknown = config.unknown_share > 0
+    samples = _check(model, points, labels, ray_id, with_unknown)
     rng = seeded_generator(seed, "fine_tune", model.origin.device)
     held_rays = _hold_out(samples, config.hold_out, rng)
     train, evaluation = _divide(samples, held_rays)
@@ -98,8 +101,8 @@ def fine_tune(
     for epoch in run.epochs(progress):
         if resample and epoch:
             fresh = resample(epoch)
-            fresh_samples = _check(model, fresh.points, fresh.labels, fresh.ray_id)
-            train = _divide(fresh_samples, held_rays)[0]
+            drawn = _check(model, fresh.points, fresh.labels, fresh.ray_id, with_unknown)
+            train = _divide(drawn, held_rays)[0]
         run.train(train)
         if after_epoch:
             after_epoch(run.state())
@@ -116,31 +119,31 @@ def _check_task(model: MapParameters, config: TuneConfig, rays_are_unknown: bool
     if not (config.tune_weights or config.tune_centers or config.tune_scales):
         raise ValueError("config must leave weights, centers or scales to tune; it freezes all")
     if config.hold_out and rays_are_unknown:
-        raise ValueError(
-            "ray_id must be given where held-out rays are to be sampled anew; got none"
-        )
+        raise ValueError("ray_id must be given if held-out rays are sampled again; got none")
 
 
 def _check(
-    model: MapParameters, points: Tensor, labels: Tensor, ray_id: Tensor | None
+    model: MapParameters,
+    points: Tensor,
+    labels: Tensor,
+    ray_id: Tensor | None,
+    with_unknown: bool = True,
 ) -> LabelledPoints:
-    """The occupied and free samples, checked, in the map's frame and in Morton order.
-
-    Unknown points are left out: `fit` has made the map say 1/2 there, and tuning on them costs
-    log-loss on held-out rays.
-    """
-    device = model.origin.device
-    is_known = as_tensor(labels, "labels", device) != UNKNOWN
-    points, labels = check_samples(points, labels, model.dim, device)
+    """The samples, checked, in the map's frame and in Morton order."""
+    device, dtype = model.origin.device, model.centers.dtype
+    points, labels = check_samples(points, labels, model.dim, device, keep_unknown=True)
+    known = labels != UNKNOWN
+    if not bool(known.any()):
+        raise ValueError("labels must hold 0 or 1; all are 1/2 (unknown)")
     rays = torch.arange(len(points), device=device)
     if ray_id is not None:
-        ray_id = torch.as_tensor(ray_id, device=device)
-        if ray_id.shape != is_known.shape:
+        rays = torch.as_tensor(ray_id, device=device)
+        if rays.shape != labels.shape:
             raise ValueError(
-                f"ray_id must be ({len(is_known)},), one per point; got {tuple(ray_id.shape)}"
+                f"ray_id must be ({len(labels)},), one per point; got {tuple(rays.shape)}"
             )
-        rays = ray_id[is_known]
-    dtype = model.centers.dtype
+    if not with_unknown:
+        points, labels, rays = points[known], labels[known], rays[known]
     local = to_map_frame(points, model.origin, dtype)
     return LabelledPoints(*in_morton_order(local, labels.to(dtype), rays))
 
@@ -157,14 +160,18 @@ def _hold_out(samples: LabelledPoints, fraction: float, rng: torch.Generator) ->
 def _divide(
     samples: LabelledPoints, held_rays: Tensor | None
 ) -> tuple[LabelledPoints, LabelledPoints]:
-    """Training points, and evaluation points: held-out points, or a subset of the training points."""
+    """Training points, and evaluation points: held-out ones, or a subset of the training points.
+
+    Unknown points are not evaluated.
+    """
     train = evaluation = samples
     if held_rays is not None:
         held = torch.isin(samples.ray_id, held_rays)
         train, evaluation = (
             LabelledPoints(*(column[rows] for column in samples)) for rows in (~held, held)
         )
-    every = -(-len(evaluation.labels) // EVALUATION_POINTS)
+    evaluation = LabelledPoints(*(part[evaluation.labels != UNKNOWN] for part in evaluation))
+    every = max(1, -(-len(evaluation.labels) // EVALUATION_POINTS))
     return train, LabelledPoints(*(column[::every] for column in evaluation))
 
 
@@ -175,15 +182,16 @@ class TuneConfig:
     ``l2`` and ``stiffness`` are relative to the summed loss of all points.
     """
 
-    epochs: int = 4  # with new neighbors, and new samples where they are drawn anew
-    passes: int = 3  # over the samples of an epoch
+    epochs: int = 4  # number of epochs; neighbors, and samples with ``resample``, are new in each
+    passes: int = 3  # passes over the samples in each epoch
     batch_size: int | None = None  # points per step; None: N / 64, between 1024 and `MAX_BATCH`
     weight_rate: float = 0.1
-    center_rate: float = 0.02  # per step, relative to the mean length-scale of the cluster
-    scale_rate: float = 0.02  # per step, of the logarithm of the length-scales
+    center_rate: float = 0.02  # learning rate of centers, relative to the mean length scale
+    scale_rate: float = 0.02  # learning rate of the logarithm of the length scales
     l2: float = 0.25  # penalty on squared weights
-    stiffness: float = 0.8  # penalty on squared offsets of centers and length-scales
+    stiffness: float = 0.8  # penalty on squared offsets of centers and length scales
     occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`
+    unknown_share: float = 0.1  # relative loss of unknown points, see `FitConfig`; 0: omit them
     hold_out: float = 0.0  # fraction of rays used to select the best epoch; 0: keep the last
     patience: int | None = None  # stop after this many epochs without improvement
     tune_weights: bool = True
@@ -204,6 +212,8 @@ class TuneConfig:
             )
         if not 0 < self.occupied_share < 1:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
+        if not self.unknown_share >= 0:
+            raise ValueError(f"unknown_share must be 0 or more; got {self.unknown_share}")
         if not 0 <= self.hold_out < 1:
             raise ValueError(f"hold_out must be at least 0 and below 1; got {self.hold_out}")
         if self.patience is not None and not self.hold_out:
@@ -223,7 +233,7 @@ def tuned_table(start: Tensor, config: TuneConfig, kernel: Kernel) -> Table:
     size = raw.diagonal(dim1=-2, dim2=-1).mean(dim=1).exp()[:, None]
     size = kernel.covariance_scale**0.5 * size.clamp(min=kernel.min_lengthscale)
     eye = torch.eye(dim, dtype=torch.bool, device=size.device)
-    unit = to_rows(  # size: (M, 1) mean length-scale of the kernels [m]
+    unit = to_rows(  # size: (M, 1) mean length scale of the kernels [m]
         torch.ones_like(size[:, 0]),
         size.expand(-1, dim),
         torch.where(eye, torch.ones_like(size)[..., None], size[..., None]),
@@ -283,16 +293,17 @@ class TuningRun:
 
     def train(self, samples: LabelledPoints) -> None:
         """Train for one epoch over the points, and keep the parameters if they are the best."""
-        config, count = self.config, len(samples.labels)
+        positions, targets = self._with_unknown(samples)
+        config, count = self.config, len(targets)
         groups = -(-count // GROUP_ROWS)
         wanted = config.batch_size or min(MAX_BATCH, max(1024, count // 64))
         batch_size = -(-count // (groups * -(-count // (groups * wanted))))
         steps = [-(-len(range(group, count, groups)) // batch_size) for group in range(groups)]
         total = self.step + (config.epochs - self.epoch) * config.passes * sum(steps)
         plan = Plan(count, batch_size, total)
-        factors = balance_classes(samples.labels, config.occupied_share)
+        factors = balance_classes(targets, config.occupied_share, config.unknown_share)
         for group, steps_per_pass in enumerate(steps):
-            columns = (samples.positions, samples.labels, factors)
+            columns = (positions, targets, factors)
             points, labels, weights = (column[group::groups].contiguous() for column in columns)
             near = self._neighbors(points)
             *batches, near = stratified_batches(
@@ -305,6 +316,13 @@ class TuningRun:
                 self.step += steps_per_pass
         self.epoch += 1
         self._keep_best(self.evaluate())
+
+    def _with_unknown(self, samples: LabelledPoints) -> tuple[Tensor, Tensor]:
+        """Positions and labels of the samples, with unknown points where `fit` places them."""
+        positions, labels, _ = samples
+        _, centers, raw = self.table.parameters(self.moving.offsets)
+        state = replace(read_state(self.model), centers=centers, raw_scale_tril=raw)
+        return settle_unknown(positions, labels, state, self.model.kernel, self.rng)
 
     def _neighbors(self, points: Tensor) -> Tensor:
         _, centers, raw = self.table.parameters(self.moving.offsets)
@@ -348,7 +366,7 @@ class TuningRun:
     def load(self, state: State) -> None:
         """Resume from a state."""
         if state["config"] != asdict(self.config):
-            raise ValueError(f"state must be of this config; got one of {state['config']}")
+            raise ValueError(f"state must belong to this config; got {state['config']}")
         start = self.table.start
         if state["start"].shape != start.shape:
             raise ValueError(

@@ -28,12 +28,12 @@ FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 class FitConfig:
     """Training settings of the weights.
 
-    The defaults train to convergence. The setting of the paper, one pass at a constant rate without
-    preconditioner, is ``FitConfig(passes=1, learning_rate=0.1, decay=False, preconditioner=False,
-    batch_size=1)``; its log-loss is higher (see docs and benchmarks).
+    The defaults train to convergence. The settings of the paper, one pass at a constant learning rate
+    without preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False,
+    preconditioner=False, batch_size=1)``; the log-loss is then higher (see docs and benchmarks).
     """
 
-    passes: int | None = None  # over all points; None: 4, or more to reach `MIN_STEPS` steps
+    passes: int | None = None  # passes over all points; None: 4, or more to reach `MIN_STEPS` steps
     batch_size: int | None = None  # points per step; None: N / 128, at least 256
     learning_rate: float = 0.5  # eta in eq. (4)
     decay: bool = True  # eta falls linearly to 0; otherwise constant
@@ -44,10 +44,10 @@ class FitConfig:
     # Class weight of occupied points, as a fraction of the loss, if classes are balanced. It exceeds
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
-    unknown_share: float = 0.25  # loss of unknown points, relative to all others
-    # 0: the number of clusters is chosen from the points, and the weights are trained. 4: the scene
-    # decides on the number (`scene_clusters`), and so many passes train centers and length-scales, too.
-    # A third of the clusters then answers points as well, but ranges and meshes are less exact.
+    unknown_share: float = 0.25  # weight of the loss of unknown points, relative to all others
+    # passes that also train centers and length scales of a small map: the number of clusters is chosen
+    # by the held-out loss of a coarse map (`scene_clusters`), about a third of the default.
+    # Probabilities are as accurate, but ranges and meshes are less exact. 4 is recommended; 0: off.
     shape_passes: int = 0
 
     def rows_per_batch(self, num_points: int) -> int:

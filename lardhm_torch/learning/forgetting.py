@@ -1,9 +1,9 @@
-"""Forgetting: evidence that a new scan contradicts.
+"""Forgetting: kept points that a new scan contradicts.
 
-Free points near the center of an occupied cluster raise its doubt, and a hit resets it. From `DOUBT` on,
-its points count less in training, so an obstacle that has been removed disappears after a few scans,
-however long it was observed before. A hit restores them: rays that graze a wall do not erase it. Points
-of unknown clusters are removed if the map predicts them as free or occupied.
+For each occupied cluster, the free points near its center are counted since its last hit (``doubts``).
+Above `DOUBT`, its kept points have less weight in training, so a removed obstacle disappears after a few
+scans, no matter how long it was observed before. A hit restores the weight, so rays at grazing incidence
+do not erase a wall. Points of unknown clusters are removed if the map predicts them as free or occupied.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
 from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
 from lardhm_torch.learning.fitting import FitConfig, FitTask
-from lardhm_torch.learning.map_state import MapState, factor_covariances
+from lardhm_torch.learning.map_state import NEVER, MapState, factor_covariances
 from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
 from lardhm_torch.learning.retraining import balanced, evidence_weights, trained
 from lardhm_torch.scans import seeded_generator
@@ -115,7 +115,12 @@ def within(state: MapState, center: Tensor, radius: float, kernel: Kernel) -> Te
     a kernel reaches are kept, so that walls outside the sphere do not become free space. The position
     is in the map frame.
     """
-    kept = torch.linalg.vector_norm(state.centers - center, dim=1) <= radius
+    near = torch.linalg.vector_norm(state.centers - center, dim=1) <= radius
+    return with_limits(state, near, kernel)
+
+
+def with_limits(state: MapState, kept: Tensor, kernel: Kernel) -> Tensor:
+    """(M,) mask of clusters -> the mask with those, not free, that a kernel of a free one reaches."""
     inside = state.rows(kept)
     outside = (~kept & (state.kinds != 1)).nonzero().squeeze(1)
     if len(inside) == 0 or len(outside) == 0:
@@ -164,10 +169,10 @@ def merge_maps(first: AnyMap, second: AnyMap, *, seed: int = 0) -> AnyMap:
 
     Clusters that match by Algorithm 2 are merged, with weights and centers averaged in proportion to
     their numbers of points; all other clusters are copied. Where the probability of the merged map
-    deviates from that of the given maps, its weights are trained on the evidence of both
+    deviates from that of the given maps, its weights are trained on the kept points of both
     maps. Maps that do not overlap are combined unchanged, and merging a map with itself does not
     change its probabilities. The posterior of the weights is discarded, because the two maps were
-    calibrated apart (see `LardHilbertMap.fit_uncertainty`).
+    calibrated separately (see `LardHilbertMap.fit_uncertainty`).
 
     Args:
         first: a `LardHilbertMap`.
@@ -260,12 +265,18 @@ def _pooled(ours: MapState, theirs: MapState, kernel: Kernel) -> MapState:
         torch.zeros_like(before.losses),
         before.doubts,
         before.fresh,
+        torch.maximum(before.times, _latest(others.times, groups, len(where))),
         torch.zeros_like(before.channel_sums).index_add_(0, rows, both_sums),
         average(before.class_weights, others.class_weights),
     )
     rest = theirs.rows(~is_matched)
     tail = MapState(*(torch.cat(pair) for pair in zip(after, rest, strict=True)))
     return ours.put(where, tail)
+
+
+def _latest(times: Tensor, groups: Tensor, count: int) -> Tensor:
+    """(count,) the latest time of each group."""
+    return times.new_full((count,), NEVER).scatter_reduce_(0, groups, times, "amax")
 
 
 def _pooled_evidence(first: MapState, second: MapState, rows: Tensor) -> Tensor:

@@ -11,8 +11,9 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.clustering import Clusters, Columns
 
 EVIDENCE = 32  # E, number of points that a cluster keeps
+NEVER = torch.finfo(torch.float64).min  # time of clusters that were learned without a time stamp
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
-HISTORY = ("evidence", "losses", "doubts", "fresh")  # used by updates only
+HISTORY = ("evidence", "losses", "doubts", "fresh", "times")  # used by updates only
 CHANNELS = ("channel_sums", "class_weights")  # None in a map without them
 
 
@@ -23,6 +24,7 @@ class MapState(Columns):
     ``evidence`` is (M, E, D), see `evidence`. ``losses`` is (M,): the mean loss of the points that a
     cluster keeps, 0 if it has not been computed. ``doubts`` is (M,), see `forgetting`.
     ``fresh`` is (M,): the number of kept points that the weights have not been trained on.
+    ``times`` is (M,) float64: when a cluster was last seen [s], see `aging`.
     ``channel_sums`` is (M, R, 1 + D) float64, see `channel_sums`; ``class_weights`` (M, K). R, K are 0
     in a map without channels or without trained classes.
     """
@@ -38,6 +40,7 @@ class MapState(Columns):
     losses: Tensor
     doubts: Tensor
     fresh: Tensor
+    times: Tensor
     channel_sums: Tensor
     class_weights: Tensor
 
@@ -88,7 +91,7 @@ def _widened(part: MapState, like: MapState, name: str) -> Tensor:
 def new_rows(
     clusters: Clusters, is_occupied: Tensor, floor: float, evidence: Tensor | None = None
 ) -> MapState:
-    """Rows of new clusters, with centers and length-scales from their moments and weights of 0.
+    """Rows of new clusters, with centers and length scales from their moments and weights of 0.
 
     Args:
         clusters: M clusters.
@@ -103,14 +106,21 @@ def new_rows(
     raw = raw_factors(factors)
     zeros = (weights.clone(), weights.clone(), weights.clone())
     moments = (clusters.counts, clusters.means, clusters.scatters)
-    without = no_channels(clusters.means)
-    return MapState(weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, *without)
+    times, without = no_times(weights), no_channels(clusters.means)
+    return MapState(
+        weights, clusters.means, raw, is_occupied, *moments, evidence, *zeros, times, *without
+    )
 
 
 def no_channels(means: Tensor) -> tuple[Tensor, Tensor]:
     """(M, D) means -> `CHANNELS` of clusters without them: (M, 0, 1 + D) sums, (M, 0) class weights."""
     count, dim = means.shape
     return means.new_zeros(count, 0, 1 + dim, dtype=torch.float64), means.new_zeros(count, 0)
+
+
+def no_times(weights: Tensor) -> Tensor:
+    """(M,) weights -> (M,) `NEVER`: clusters that were learned without a time stamp."""
+    return torch.full_like(weights, NEVER, dtype=torch.float64)
 
 
 def no_evidence(means: Tensor) -> Tensor:

@@ -38,6 +38,7 @@ class MapTensors(nn.Module):
     losses: Tensor
     doubts: Tensor
     fresh: Tensor
+    times: Tensor
     posterior_means: Tensor
     posterior_variances: Tensor
     posterior_scales: Tensor
@@ -61,7 +62,8 @@ class MapTensors(nn.Module):
         self.num_neighbors = num_neighbors
         self.covariance_scale = float(covariance_scale)
         self.min_lengthscale = float(min_lengthscale)
-        self.is_packed = False  # the map answers but does not learn: it was rounded to be sent
+        self.max_age: float | None = None  # [s], see `LardHilbertMap`
+        self.is_packed = False  # a packed map is rounded, for queries only
         with normal_tensors():
             self._register_empty(dim, device, dtype)
         self.channel_layout: Layout = {}  # of channel_sums; see `channel_sums`
@@ -98,6 +100,7 @@ class MapTensors(nn.Module):
             "losses": weights.new_zeros(0),
             "doubts": weights.new_zeros(0),
             "fresh": weights.new_zeros(0),
+            "times": weights.new_zeros(0, dtype=torch.float64),
             "posterior_means": weights.new_zeros(0),
             "posterior_variances": weights.new_zeros(0),
             "posterior_scales": weights.new_ones(2),
@@ -118,12 +121,12 @@ class MapTensors(nn.Module):
 
     @property
     def scale_tril(self) -> Tensor:
-        """(M, D, D) lower Cholesky factors of the kernels [m], settings of the kernel applied."""
+        """(M, D, D) lower Cholesky factors of the kernels [m], scaled and bounded by the settings."""
         return kernel_factors(at_least_float32(self.raw_scale_tril), self.kernel)
 
     @property
     def kernel(self) -> Kernel:
-        """Number of neighbors, covariance scale and minimum length-scale of the kernels."""
+        """Number of neighbors, covariance scale and minimum length scale of the kernels."""
         return Kernel(self.num_neighbors, self.covariance_scale, self.min_lengthscale)
 
     @property
@@ -142,8 +145,9 @@ class MapTensors(nn.Module):
         yield from self.named_buffers(recurse=False)
 
     def _apply(self: AnyTensors, fn: Any, recurse: bool = True) -> AnyTensors:
-        """Cast all tensors except origin and channel sums, which remain float64 (`.to()`, ...)."""
-        exact = {"origin": self.origin, "channel_sums": self.channel_sums}
+        """Cast all tensors except origin, times and channel sums: they remain float64 (`.to()`, ...)."""
+        names = ("origin", "times", "channel_sums")
+        exact = {name: getattr(self, name) for name in names}
         with self.lock.writing(), normal_tensors():
             super()._apply(fn, recurse)
             for name, tensor in exact.items():

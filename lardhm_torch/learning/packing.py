@@ -28,7 +28,7 @@ from lardhm_torch.learning.parameters import MapParameters, read_state
 
 PRECISION = 6  # fractional bits: changes scores by less than 0.0005 and probabilities by about 0.01
 LARGEST = 1 << 30  # of an integer
-MOST_OCTAVES = 30  # length-scales from 2^-30 to 2^30 m: all numbers are finite in float32
+MOST_OCTAVES = 30  # length scales from 2^-30 to 2^30 m: all numbers are finite in float32
 
 
 def check_precision(precision: int) -> None:
@@ -81,7 +81,7 @@ def _check_octaves(octaves: np.ndarray) -> None:
     largest = np.abs(octaves).max(initial=0)
     if largest > MOST_OCTAVES:
         raise ValueError(
-            f"length-scales must be between 2^-{MOST_OCTAVES} and 2^{MOST_OCTAVES} m; got 2^{largest}"
+            f"length scales must be between 2^-{MOST_OCTAVES} and 2^{MOST_OCTAVES} m; got 2^{largest}"
         )
 
 
@@ -189,5 +189,5 @@ def _load_packed(path: str | os.PathLike[str]) -> dict[str, Any]:
         if block is not None:
             state = with_packed_channels(state, *block, 1 << packed.precision)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{os.fspath(path)} must be a packed map, whole; {error}") from error
+        raise ValueError(f"{os.fspath(path)} must be a complete packed map; {error}") from error
     return state

@@ -16,7 +16,7 @@ from lardhm_torch.learning.channel_sums import Layout
 from lardhm_torch.learning.map_state import CHANNELS, MapState, no_channels
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import extend_channels, resize, set_channels, set_class_weights
-from lardhm_torch.learning.state_checks import check_reach
+from lardhm_torch.learning.state_checks import check_max_age, check_reach
 from lardhm_torch.learning.state_dicts import drop_spare_rows, make_room
 
 AnyMap = TypeVar("AnyMap", bound="MapParameters")
@@ -32,15 +32,15 @@ class MapParameters(MapTensors):
     """
 
     def reading(self) -> AbstractContextManager[None]:
-        """A context in which all queries see the same map: other threads wait before they change it.
+        """A context in which all queries see the same map. Threads that change the map wait.
 
-        Every single query sees one map anyway, while another thread runs `fit`, `update`, `fine_tune`
-        or any other function of this package that changes the map.
+        A single query needs no context: it always sees the map before or after a change by `fit`,
+        `update`, `fine_tune` or another function of this package in another thread.
         """
         return self.lock.reading()
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """See `torch.nn.Module.load_state_dict`; the map adopts the number of clusters."""
+        """See `torch.nn.Module.load_state_dict`; the map gets as many clusters as the state dict has."""
         with self.lock.changing(), self.lock.writing():
             return super().load_state_dict(*args, **kwargs)
 
@@ -58,7 +58,7 @@ class MapParameters(MapTensors):
     def parameter_groups(self, weight_decay: float = 0.0) -> list[dict[str, Any]]:
         """Parameter groups for an optimizer, with weight decay on the weights only.
 
-        Weight decay would pull centers to the map's origin and length-scales to 1 m.
+        Weight decay would pull centers to the map's origin and length scales to 1 m.
         """
         return [
             {"params": [self.weights], "weight_decay": weight_decay},
@@ -86,6 +86,8 @@ class MapParameters(MapTensors):
         state = {"format_version": map_files.FORMAT_VERSION, **self.settings}
         if self.is_packed:
             state["is_packed"] = True
+        if self.max_age is not None:
+            state["max_age"] = self.max_age
         if self.channel_layout:
             state |= {"channels": self.channel_layout, "class_scale": self.class_scale}
         return state
@@ -93,12 +95,14 @@ class MapParameters(MapTensors):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Whether the map is packed; `make_room` has already checked that the settings agree."""
         self.is_packed = bool(state.get("is_packed", False))
+        check_max_age(state.get("max_age"))
+        self.max_age = state.get("max_age")
 
     def check_learns(self) -> None:
-        """Raise a ValueError if the map is packed: it has lost what learning continues from."""
+        """Raise a ValueError if the map is packed: it has no points and moments to train from."""
         if self.is_packed:
             raise ValueError(
-                "model must hold what it learned from; a packed map answers but does not learn. "
+                "model must not be packed; a packed map supports queries, but no training. "
                 "Load the file written by save, or make a new map"
             )
 

@@ -76,8 +76,8 @@ def _drop_outliers(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
         points, labels = points[kept], labels[kept]
     if not bool((labels > UNKNOWN).any()):
         warnings.warn(
-            f"none of {len(points)} points is occupied, so the map holds free space only. Hits "
-            "beyond max_range of SamplingConfig do not count as hits",
+            f"none of {len(points)} points is occupied, so the map has free space only. Hits "
+            "beyond max_range of SamplingConfig count as no-return",
             stacklevel=4,
         )
     return points, labels

@@ -1,9 +1,9 @@
-"""Regrouping: new points and the evidence of the clusters near them, grouped anew where they changed.
+"""Regrouping of new points and of the kept points of the clusters near them.
 
-One step of adaptive k-means on the kept points, for each class by itself. Clusters whose points the
-map predicts badly are divided, new points join the nearest cluster or form new ones, every point of a
-changed cluster goes to its nearest center, and clusters with too few points are dissolved into their
-neighbors.
+This is one step of adaptive k-means on the kept points, separately for each class. Clusters whose points
+have a large loss are divided, new points join the nearest cluster or form new clusters, all points of
+changed clusters are reassigned to their nearest centers, and clusters with too few points are dissolved
+into their neighbors.
 """
 
 from __future__ import annotations
@@ -166,6 +166,7 @@ def _half(
         rows,
         weights=parents.weights,
         doubts=parents.doubts,
+        times=parents.times,
         fresh=kept_counts(evidence).to(parents.fresh),
         channel_sums=parents.channel_sums * fraction[:, None, None],
         class_weights=parents.class_weights,
@@ -248,14 +249,18 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     """
     sizes = groups.sizes + received
     alive = sizes >= (1 if rule.few else MIN_COUNT)
+    occupied = rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = groups.rows(kind)
         some = alive[own]
         if not bool(some.any()):
             some = sizes[own] > 0
-        limit = max(1, factor * rule.occupied, int((own < before).sum()))
+        if kind == 0 and rule.grows:
+            occupied = max(occupied, int(some.sum()))
+        added = int((own >= before).sum())
+        limit = max(1, factor * occupied, len(own) - added, added if rule.grows else 0)
         excess = int(some.sum()) - limit
-        if excess > 0 and not rule.grows:
+        if excess > 0:
             order = torch.where(some, sizes[own], sizes.amax() + 1).argsort(stable=True)
             some[order[:excess]] = False
         alive[own] = some

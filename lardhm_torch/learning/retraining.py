@@ -1,4 +1,4 @@
-"""Training of the weights of changed clusters on the evidence around them."""
+"""Training of the weights of changed clusters on the kept points around them."""
 
 from __future__ import annotations
 

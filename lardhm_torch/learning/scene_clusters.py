@@ -1,10 +1,10 @@
 """Maps with as many clusters as their scene needs.
 
-A coarse map of a sample of the points shows how hard the scene is: its log-loss on other points, summed
-over all points, is what clusters can still explain. The map gets one cluster for every
-`NATS_PER_PARAMETER` of this loss and parameter of a cluster. A large empty room needs few clusters,
-however many points it has; sparse scans of a street need thousands. Weights, centers and length-scales
-are then trained together, so that few clusters are enough.
+A coarse map is trained on a sample of the points. Its log-loss on other points, scaled to all points,
+measures how much is still to be explained. The map gets one cluster for every `NATS_PER_PARAMETER` of
+this loss times the number of parameters of a cluster. A large empty room needs few clusters, even with
+many points; sparse scans of a street need thousands. Weights, centers and length scales are then trained
+together, so that few clusters are enough.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ COARSE_POINTS = 1000  # known points of the scene per cluster of the coarse map 
 COARSE_SAMPLE = 128  # ... and those that it is trained on
 LOSS_POINTS = 1 << 16  # on which its loss is measured
 MIN_COARSE = 16  # with fewer clusters, its loss says little: see `clustering.choose_num_clusters`
-START_PASSES = 2  # of the weights alone, before centers and length-scales move
+START_PASSES = 2  # of the weights alone, before centers and length scales move
 UNKNOWN_FACTOR = 0.6  # on `FitConfig.unknown_share`: few clusters get more unknown points each
 CLASS_RATIOS = (5, 3, 1)  # numbers of occupied, free and unknown clusters
 
@@ -122,7 +122,7 @@ def class_totals(labels: Tensor, num_clusters: int) -> list[int]:
 
 
 def fit_shapes(points: Tensor, labels: Tensor, num_clusters: int, task: FitTask) -> MapState:
-    """Cluster the samples, train the weights, then weights, centers and length-scales together."""
+    """Cluster the samples, train the weights, then weights, centers and length scales together."""
     config = replace(
         task.config,
         passes=task.config.passes or START_PASSES,
@@ -133,7 +133,7 @@ def fit_shapes(points: Tensor, labels: Tensor, num_clusters: int, task: FitTask)
 
 
 def train_shapes(state: MapState, samples: Batched, task: FitTask) -> MapState:
-    """Continue the training with centers and length-scales, over the neighbors that `fit` has found.
+    """Continue the training with centers and length scales, over the neighbors that `fit` has found.
 
     The steps are those of `fine_tune`; unknown points take part.
 

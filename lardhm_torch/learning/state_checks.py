@@ -12,7 +12,7 @@ from lardhm_torch.features import Kernel
 from lardhm_torch.learning.map_state import MapState
 
 NOT_NEGATIVE = ("counts", "losses", "doubts", "fresh", "posterior_variances", "posterior_scales")
-ROUNDING = 1 / 16  # of a length-scale: more than that must not be lost by rounding a center
+ROUNDING = 1 / 16  # of a length scale: more than that must not be lost by rounding a center
 MOST_NEIGHBORS = 1 << 30  # as many as the native kernel can index
 
 
@@ -35,6 +35,15 @@ def check_settings(
             "covariance_scale and min_lengthscale must be finite; "
             f"got {covariance_scale} and {min_lengthscale}"
         )
+
+
+def check_max_age(max_age: float | None) -> None:
+    """Raise a ValueError if ``max_age`` is neither None nor a time [s] above 0."""
+    if max_age is None:
+        return
+    number = isinstance(max_age, (int, float)) and not isinstance(max_age, bool)
+    if not number or not 0 < max_age < math.inf:
+        raise ValueError(f"max_age must be > 0 s and finite, or None; got {max_age!r}")
 
 
 def check_values(tensors: Mapping[str, Tensor]) -> None:
@@ -60,13 +69,13 @@ def check_values(tensors: Mapping[str, Tensor]) -> None:
 
 
 def _check_factors(raw_scale_tril: Tensor) -> None:
-    """Raise a ValueError if a logarithm on a diagonal is that of no length-scale."""
+    """Raise a ValueError if a logarithm on a diagonal is that of no length scale."""
     logs = raw_scale_tril.diagonal(dim1=-2, dim2=-1)
     most = math.log(torch.finfo(torch.promote_types(logs.dtype, torch.float32)).max)
     if bool((logs > most).any()):
         raise ValueError(
             f"raw_scale_tril must be at most {most:.4g} on its diagonals, which are logarithms of "
-            f"length-scales; got {logs.max().item():g}"
+            f"length scales; got {logs.max().item():g}"
         )
 
 
@@ -74,7 +83,7 @@ def check_reach(state: MapState, kernel: Kernel) -> None:
     """Raise a ValueError if clusters are so far from the origin that rounding would move surfaces.
 
     The spacing of floating point numbers at a center must be below `ROUNDING` of the smallest
-    length-scale of the cluster.
+    length scale of the cluster.
 
     Args:
         state: M clusters, map frame [m].
@@ -88,6 +97,6 @@ def check_reach(state: MapState, kernel: Kernel) -> None:
         raise ValueError(
             "clusters must be near the origin of the map for their size; got one of "
             f"{float(scales[worst]):.3g} m at {float(state.centers[worst]):.3g} m, which "
-            f"{str(state.centers.dtype).removeprefix('torch.')} cannot hold. Use a map in float64, or "
+            f"{str(state.centers.dtype).removeprefix('torch.')} cannot represent. Use a float64 map, or "
             "one map for each place"
         )

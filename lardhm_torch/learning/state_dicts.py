@@ -11,7 +11,7 @@ from torch import Tensor
 from lardhm_torch.channels import CLASS
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
-from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence
+from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence, no_times
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import resize, set_channels
 from lardhm_torch.learning.state_checks import check_values
@@ -71,6 +71,12 @@ def channel_shapes(
     return layout, {name: shapes[name] for name in present}
 
 
+def file_state(state: dict[str, Any], evidence: bool) -> dict[str, Any]:
+    """What a map file holds of a state dict; without ``evidence``, nothing that only updates need."""
+    kept = {name: value for name, value in state.items() if evidence or name not in HISTORY}
+    return occupied_sums(kept)
+
+
 def occupied_sums(state: dict[str, Any]) -> dict[str, Any]:
     """The state dict of a map with the channel sums of its occupied clusters alone: others have none."""
     if "channel_sums" not in state:
@@ -104,8 +110,9 @@ def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
         return
     for name in HISTORY:
         if len(state.get(prefix + name, ())) == 0:
-            rows = centers.new_zeros(len(centers))
-            state[prefix + name] = no_evidence(centers) if name == "evidence" else rows
+            zeros = centers.new_zeros(len(centers))
+            empty = {"evidence": no_evidence(centers), "times": no_times(zeros)}
+            state[prefix + name] = empty.get(name, zeros)
 
 
 def drop_spare_rows(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:

@@ -1,4 +1,4 @@
-"""Steps of fine-tuning: Adam on weights, centers and length-scales at once, over kept neighbors.
+"""Steps of fine-tuning: Adam on weights, centers and length scales at once, with fixed neighbors.
 
 The parameters of a cluster are one row of a table, so that a step is the same arithmetic for all of
 them. `plain_steps` is the definition; the native library does the same in one pass per batch.

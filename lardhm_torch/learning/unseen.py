@@ -1,9 +1,9 @@
-"""Unknown space: training points of label 1/2, so that the map says 1/2 where nothing was seen.
+"""Unknown points: training points of label 1/2, so that the probability of unobserved space is 1/2.
 
-Kernels reach across walls and beyond what was seen, and no occupied or free sample contradicts them
-there. Unknown points do: `sampling` places them behind hits, where no ray was, and `draw_tails` in
-the tails of the clusters. They form clusters of their own, whose weights cancel what reaches across,
-so that the clusters of surfaces and of free space keep their capacity.
+Kernels extend across walls and beyond observed space, where no occupied or free sample contradicts
+them. Unknown points do: `sampling` places them behind hits, in cells that no ray crossed, and
+`draw_tails` in the tails of the clusters. They form separate clusters, whose weights cancel these
+contributions, so that the other clusters need not represent unobserved space.
 """
 
 from __future__ import annotations

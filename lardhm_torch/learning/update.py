@@ -1,9 +1,9 @@
-"""Incremental update with one more scan: evidence, regrouping, and training where it changed.
+"""Incremental update with one more scan: evidence, regrouping, and training of changed clusters.
 
 A map keeps a bounded sample of the real points of each cluster (`evidence`). An update adds the points
-of a scan to it, drops what they contradict (`forgetting`), groups the changed points anew
-(`regrouping`) and trains the weights there on kept points with their labels (`retraining`). So the map
-is always trained on a sample of all that was seen. Algorithm 2 as printed is available, too.
+of a scan to it, reduces the weight of contradicted points (`forgetting`), regroups changed clusters
+(`regrouping`) and trains their weights on the kept points and their labels (`retraining`). So the map
+is always trained on a sample of all scans. Algorithm 2 of the paper is also available.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class UpdateConfig:
     """Settings of an incremental update."""
 
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
-    zeta: float = 1.0  # [m] maximum distance of merged clusters in Algorithm 2
-    split_loss: float = 0.01  # clusters whose points have a larger mean loss are divided
-    cell_edge: float = 0.1  # [m] of each class at most four new points are used in each cell
-    max_points: int = 20_000  # new points of each class that are used; more are drawn at random
-    max_trained: int = 5_000  # changed clusters that are trained; the others follow later
+    zeta: float = 1.0  # [m] maximum distance between merged clusters in Algorithm 2
+    split_loss: float = 0.01  # clusters whose points have a larger mean log-loss are divided
+    cell_edge: float = 0.1  # [m] at most 4 new points of each class in a cell of this edge are used
+    max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
+    max_trained: int = 5_000  # maximum number of changed clusters to train; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:

@@ -1,8 +1,8 @@
-"""The fast twin of `features`: the same values and gradients on the CPU, in one fused pass.
+"""The native version of `features`: the same values and gradients on the CPU, in one fused pass.
 
-Never needed for correctness: where `supports` says no, the functions here call the definition.
-Every operator checks that the index it is given was made from the very centers it is given, and
-makes its own otherwise, so a stale index costs time and never an answer.
+It is optional: if `supports` returns False, the functions here call the definition. Every operator
+checks that its index belongs to the given centers and builds a new one otherwise, so a stale index
+costs time but never gives a wrong result.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _registered = False
 
 
 def available() -> bool:
-    """Whether the kernel is built and loaded; the first call does both."""
+    """Whether the native library is loaded; the first call builds it if necessary, and loads it."""
     global _registered
     if not library_available():
         return False
@@ -34,7 +34,7 @@ def available() -> bool:
 
 
 def supports(*tensors: Tensor) -> bool:
-    """Whether the kernel answers for tensors like these; the first is (N, D).
+    """Whether the native library supports tensors like these; the first is (N, D).
 
     It does for the CPU, float32 and float64, 2-D and 3-D, but not under the transforms of `torch.func`
     nor for dual tensors: the definition batches itself and pushes tangents forward.

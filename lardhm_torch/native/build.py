@@ -1,8 +1,8 @@
-"""Load the kernel: the library that a wheel ships, else one compiled for this machine, else none.
+"""Load the native library: from the wheel, else compiled for this machine, else none.
 
-- Linux on x86-64: the wheel for this platform ships the kernel; the pure wheel compiles it.
+- Linux on x86-64: the wheel for this platform contains it; with the pure wheel it is compiled.
 - Linux on other processors, macOS: it is compiled on first use.
-- Windows, and wherever there is no compiler: the plain path, with one warning.
+- Windows, and systems without a compiler: plain torch is used, with one warning.
 
 Two libraries register the same operators, so a process loads one of them at most.
 """
@@ -30,10 +30,10 @@ _loaded: bool | None = None
 
 
 def available() -> bool:
-    """Whether the kernel can be used; the first call loads it, and compiles it if it must.
+    """Whether the native library can be used; the first call loads it, and compiles it if necessary.
 
-    ``LARDHM_NATIVE=0`` in the environment means no, silently; without a library that fits and a
-    compiler that works the answer is no, with one warning.
+    False without a warning if ``LARDHM_NATIVE=0`` is set in the environment; False with one warning if
+    there is neither a suitable library nor a working compiler.
     """
     global _loaded
     if _loaded is None:
@@ -54,8 +54,8 @@ def _try_to_load() -> bool:
     except (OSError, RuntimeError, subprocess.SubprocessError) as error:
         reason = " ".join(f"{problem}, and {error}".split())[:400]
         warnings.warn(
-            f"the native kernel is not available, maps answer several times slower: {reason}. "
-            "LARDHM_NATIVE=0 silences this",
+            f"the native library is not available, so queries are several times slower: {reason}. "
+            "LARDHM_NATIVE=0 silences this warning",
             stacklevel=4,
         )
         return False
@@ -66,11 +66,11 @@ def _load_shipped() -> str | None:
     """Load what the installation ships; why that is not possible, or None."""
     library = shipped_library()
     if library is None:
-        return f"no compiled kernel is installed for {platform.system()} on {platform.machine()}"
+        return f"no compiled library is installed for {platform.system()} on {platform.machine()}"
     try:
         torch.ops.load_library(str(library))
     except OSError as error:
-        return f"the installed kernel does not load ({error})"
+        return f"the installed library does not load ({error})"
     return None
 
 

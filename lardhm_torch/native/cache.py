@@ -1,7 +1,7 @@
 """A folder for compiled code that nobody else can write to.
 
-Loading a library runs it. So a folder is used only if nobody but the user and root can put a file
-there or replace the folder: its owner and mode and those of the folders above it are checked.
+Loading a library executes code. Therefore a folder is used only if nobody but the user and root can
+put a file there or replace the folder: owner and mode of the folder and its parents are checked.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pathlib import Path
 
 
 def cached_file(name: str, make: Callable[[Path], None]) -> Path:
-    """A file of the kernel cache, which ``make(path)`` writes if it is missing.
+    """A file of the library cache, which ``make(path)`` writes if it is missing.
 
-    The cache is ``LARDHM_CACHE``, or ``~/.cache/lardhm_torch``. If it cannot be used, a warning says
-    why, and a temporary folder takes its place. The file gets its name in one step: a process that is
-    killed, or one that runs at the same time, leaves no half of it.
+    The cache is ``LARDHM_CACHE``, or ``~/.cache/lardhm_torch``. If it cannot be used, a warning gives
+    the reason, and a temporary folder is used. The file is written atomically, so a process that is
+    killed, or one that runs at the same time, leaves no incomplete file.
 
     Raises:
         OSError: no folder can be used.
@@ -41,12 +41,12 @@ def cached_file(name: str, make: Callable[[Path], None]) -> Path:
             continue
         if problems:
             warnings.warn(
-                f"the kernel cache cannot be used: {'; '.join(problems)}. The compiled kernel is kept "
+                f"the library cache cannot be used: {'; '.join(problems)}. The compiled library is kept "
                 f"in {folder}; set LARDHM_CACHE to a folder of your own",
                 stacklevel=6,
             )
         return kept
-    raise OSError(f"no folder for the compiled kernel: {'; '.join(problems)}; set LARDHM_CACHE")
+    raise OSError(f"no folder for the compiled library: {'; '.join(problems)}; set LARDHM_CACHE")
 
 
 def check_private(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Compile the C++ sources of the kernel into one shared library."""
+"""Compile the C++ sources of the native library."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What rays crossed: cells of space, and surfaces that other rays hit.
+"""Cells of space that rays crossed, and surfaces of other hits that rays passed through.
 
-A ray that leaves through a door says that the wall has an opening there. Its free samples rarely lie
-in the plane of the wall, and the clusters of the wall would close the door. `passages` finds such
+A ray that leaves through a door shows that the wall has an opening there. Its free samples rarely lie
+in the plane of the wall, so the clusters of the wall would close the door. `passages` finds such
 places: hits are divided into patches of neighbors, and a ray passes through a patch if it comes within
 a few standard deviations of it, from one side of its plane to the other.
 """
@@ -41,7 +41,7 @@ class Passages(NamedTuple):
     """Places where rays pass through patches, by ray."""
 
     rays: Tensor  # (P,) row of the ray, ascending
-    depths: Tensor  # (P,) where on the ray the kernel of the patch is largest [m]
+    depths: Tensor  # (P,) depth along the ray where the kernel of the patch is largest [m]
     widths: Tensor  # (P,) standard deviation of that kernel along the ray [m]
     is_flat: Tensor  # (P,) bool, whether the patch is flat
 

@@ -1,7 +1,7 @@
-"""The operator `lardhm::occupancy`, which answers the queries of a map.
+"""The operator `lardhm::occupancy`, which computes the queries of a map.
 
 It is defined as soon as the package and torch are imported, so that `torch.export.load` finds it in a
-new process. The native library, loaded at the first query, brings the implementation for the CPU.
+new process. The native library, loaded at the first query, contains the implementation for the CPU.
 Elsewhere, under the transforms of `torch.func` and in forward-mode differentiation, the operator is
 the definition in `features`.
 """

@@ -1,6 +1,6 @@
 // Fine-tuning over kept neighbors, batch after batch: forward, backward and Adam in one pass.
 //
-// The same arithmetic as `tuning_steps.plain_steps`. A point's neighbors are the lanes of a register.
+// The same arithmetic as `tuning_steps.plain_steps`.
 
 #include <algorithm>
 #include <cmath>
@@ -8,22 +8,11 @@
 #include <limits>
 #include <vector>
 
-#include "kernel.h"
+#include "neighbor_lanes.h"
 #include "tensors.h"
 
 namespace lardhm {
 namespace tuning {
-
-// Columns of the table of parameters: weight, center, lower factor row by row.
-template <int D>
-constexpr int kColumns = 1 + D + D * (D + 1) / 2;
-
-// A cluster in the memory of the gradient: center, 1 / diagonal, below the diagonal, weight.
-template <int D>
-struct Record {
-  static constexpr int inverse = D, below = 2 * D, weight = below + D * (D - 1) / 2;
-  static constexpr int fields = weight + 1, stride = 16;  // stride: of gradients, too
-};
 
 // What stays the same over a call. Names as in `tuning_steps.Plan`.
 struct Plan {
@@ -67,170 +56,6 @@ struct Table {
   const T *start, *unit;
   T *offsets, *mean, *square;
   int64_t count;
-};
-
-// Lanes of a (0 .. W - 1) and b (W .. 2 W - 1), picked by number.
-template <class T>
-inline typename Simd<T>::V shuffle(typename Simd<T>::V a, typename Simd<T>::V b,
-                                   typename Simd<T>::I lanes) {
-#if defined(__GNUC__) && !defined(__clang__)
-  return __builtin_shuffle(a, b, lanes);
-#else
-  typename Simd<T>::V picked;
-  for (int i = 0; i < Simd<T>::W; ++i)
-    picked[i] = lanes[i] < Simd<T>::W ? a[lanes[i]] : b[lanes[i] - Simd<T>::W];
-  return picked;
-#endif
-}
-
-// Lane i of register j becomes lane j of register i, for W registers: in each stage, blocks of 1, 2, 4, ...
-// lanes change places.
-template <class T, int Stage = 1>
-inline void transpose(typename Simd<T>::V* v) {
-  using V = typename Simd<T>::V;
-  using I = typename Simd<T>::I;
-  constexpr int W = Simd<T>::W;
-  if constexpr (Stage < W) {
-    I first, second;
-    for (int lane = 0; lane < W; ++lane) {
-      first[lane] = lane & Stage ? W + lane - Stage : lane;
-      second[lane] = lane & Stage ? W + lane : lane + Stage;
-    }
-    for (int i = 0; i < W; ++i) {
-      if (i & Stage) continue;
-      const V a = v[i], b = v[i + Stage];
-      v[i] = shuffle<T>(a, b, first);
-      v[i + Stage] = shuffle<T>(a, b, second);
-    }
-    transpose<T, 2 * Stage>(v);
-  }
-}
-
-// Fields of a point's neighbors, then their gradients: a row of lanes each.
-template <class T, int D>
-struct Lanes {
-  using V = typename Simd<T>::V;
-  static constexpr int W = Simd<T>::W;
-  int64_t k, rows;
-  std::vector<V> memory;
-  V *fields, *grads, *squared, *kernel, *z;
-  std::vector<V> exists;  // 1 in lanes of neighbors
-
-  explicit Lanes(int64_t k_) : k(k_), rows((k_ + W - 1) / W) {
-    constexpr int kFields = Record<D>::fields, kGrads = kColumns<D>;
-    memory.assign(rows * (kFields + kGrads + 2 + D), V{});
-    fields = memory.data();
-    grads = fields + rows * kFields;
-    squared = grads + rows * kGrads;
-    kernel = squared + rows;
-    z = kernel + rows;
-    exists.assign(rows, V{});
-    for (int64_t j = 0; j < k; ++j) lane(exists.data(), j) = 1;
-  }
-
-  static T& lane(V* row, int64_t j) { return reinterpret_cast<T*>(row)[j]; }
-
-  void read(const int32_t* index, const T* records) {
-    V block[W];
-    for (int64_t r = 0; r < rows; ++r)
-      for (int c = 0; c < Record<D>::fields; c += W) {
-        for (int j = 0; j < W; ++j) {
-          const int64_t neighbor = std::min<int64_t>(r * W + j, k - 1);
-          block[j] = load<V>(records + int64_t(index[neighbor]) * Record<D>::stride + c);
-        }
-        transpose<T>(block);
-        for (int f = c; f < std::min(Record<D>::fields, c + W); ++f)
-          fields[f * rows + r] = block[f - c];
-      }
-  }
-
-  void add_to(const int32_t* index, T* sums) const {
-    V block[W];
-    for (int64_t r = 0; r < rows; ++r)
-      for (int c = 0; c < kColumns<D>; c += W) {
-        for (int g = 0; g < W; ++g)
-          block[g] = c + g < kColumns<D> ? grads[(c + g) * rows + r] : V{};
-        transpose<T>(block);
-        for (int64_t j = r * W; j < std::min(k, (r + 1) * W); ++j) {
-          T* sum = sums + int64_t(index[j]) * Record<D>::stride + c;
-          const V total = load<V>(sum) + block[j - r * W];
-          std::memcpy(sum, &total, sizeof(V));
-        }
-      }
-  }
-
-  // Whitened offsets, kernel values and squared distances; returns the largest of the latter.
-  T forward(const T* x) {
-    V most = {};
-    for (int64_t r = 0; r < rows; ++r) {
-      V offset[D], zr[D], shape[Record<D>::fields - D], sum = {};
-      for (int d = 0; d < D; ++d) offset[d] = x[d] - fields[d * rows + r];
-      for (int f = D; f < Record<D>::fields; ++f) shape[f - D] = fields[f * rows + r];
-      for (int d = 0; d < D; ++d) sum += offset[d] * offset[d];
-      whiten(offset, shape, zr);
-      squared[r] = sum * exists[r];
-      for (int d = 0; d < D; ++d) z[d * rows + r] = zr[d];
-      kernel[r] = kernel_of<T, D>(zr) * exists[r];
-      most = squared[r] > most ? squared[r] : most;
-    }
-    return -smallest_lane<T>(-most);
-  }
-
-  static void whiten(const V* offset, const V* shape, V* zr) {
-    const V* below = shape + D;
-    zr[0] = offset[0] * shape[0];
-    zr[1] = (offset[1] - zr[0] * below[0]) * shape[1];
-    if constexpr (D == 3) zr[2] = (offset[2] - zr[0] * below[1] - zr[1] * below[2]) * shape[2];
-  }
-
-  T log_odds(T fading, bool fades) const {
-    V sum = {};
-    for (int64_t r = 0; r < rows; ++r) {
-      const V fade = fades ? fade_of<T>(squared[r] * fading) : V{} + T(1);
-      sum += kernel[r] * fade * fields[Record<D>::weight * rows + r];
-    }
-    return sum_lanes<T>(sum);
-  }
-
-  // Gradients of weight, center and factor; `pull` is that of the log-odds.
-  void backward(const T* x, T pull, T farthest, T fading, bool fades) {
-    V reach = {}, tied = {};
-    for (int64_t r = 0; r < rows; ++r) {
-      const V t = squared[r] * fading, weight = fields[Record<D>::weight * rows + r];
-      const V value = kernel[r] * (fades ? fade_of<T>(t) : V{} + T(1));
-      grads[r] = pull * value;
-      const V share = pull * weight * value;
-      const V slope = fades ? pull * weight * kernel[r] * fade_slope<T>(t) * fading : V{};
-      reach -= slope * t;
-      tied += squared[r] >= farthest ? exists[r] : V{};
-      shape_gradient(x, r, share, T(2) * slope);
-    }
-    if (!fades) return;
-    const T pulled = T(2) * sum_lanes<T>(reach) / sum_lanes<T>(tied);
-    for (int64_t r = 0; r < rows; ++r) {
-      const V at_it = squared[r] >= farthest ? exists[r] * pulled : V{};
-      for (int d = 0; d < D; ++d)
-        grads[(1 + d) * rows + r] += at_it * (fields[d * rows + r] - x[d]);
-    }
-  }
-
-  // y = inv(L)^T z; d log_odds / dc = w phi y, by L: w phi y z^T; the fade adds 2 slope (c - x).
-  void shape_gradient(const T* x, int64_t r, V share, V slope) {
-    const auto field = [&](int f) { return fields[f * rows + r]; };
-    V y[D], zr[D];
-    for (int d = 0; d < D; ++d) zr[d] = z[d * rows + r];
-    y[D - 1] = share * zr[D - 1] * field(Record<D>::inverse + D - 1);
-    if constexpr (D == 3)
-      y[1] = (share * zr[1] - y[2] * field(Record<D>::below + 2)) * field(Record<D>::inverse + 1);
-    y[0] = share * zr[0] - y[1] * field(Record<D>::below);
-    if constexpr (D == 3) y[0] -= y[2] * field(Record<D>::below + 1);
-    y[0] *= field(Record<D>::inverse);
-    for (int d = 0; d < D; ++d)
-      grads[(1 + d) * rows + r] = y[d] + slope * (field(d) - x[d]);
-    V* factor = grads + (1 + D) * rows + r;
-    for (int i = 0; i < D; ++i)
-      for (int j = 0; j <= i; ++j, factor += rows) *factor = y[i] * zr[j];
-  }
 };
 
 // Adds the gradients of the mean loss of the rows begin .. end, of a batch of `size`, to the sums.

@@ -21,11 +21,11 @@ CHUNK_POINTS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A robot as S spheres in a frame of its own.
+    """A robot modeled as S spheres in its own frame.
 
     Attributes:
-        centers: (S, D) [m].
-        radii: (S,) [m].
+        centers: (S, D) centers of the spheres [m].
+        radii: (S,) radii of the spheres [m].
     """
 
     centers: Tensor
@@ -64,15 +64,15 @@ class Body:
 def body_distance(
     model: OccupancyMap, body: Body, poses: TensorLike, max_distance: float = math.inf
 ) -> Tensor:
-    """Distance from a body to the nearest surface; differentiable in the poses and the body.
+    """Distance from a body to the nearest surface; differentiable with respect to poses and body.
 
-    The least of `signed_distance` minus the radius among its spheres.
+    This is the smallest difference between the `signed_distance` of a sphere's center and its radius.
 
     Args:
         model: the map.
         body: the robot.
         poses: (..., D + 1, D + 1) ``world_from_body``; their rotations are not checked.
-        max_distance: distance of a sphere's center where no surface is nearer [m].
+        max_distance: upper bound on the distance of a sphere's center [m], see `signed_distance`.
 
     Returns:
         (...) float64 distances [m], negative in a collision.
@@ -88,17 +88,17 @@ def body_distance(
 def capsule_distance(
     model: OccupancyMap, starts: TensorLike, ends: TensorLike, radii: TensorLike | float = 0.0
 ) -> Tensor:
-    """Distance from capsules to the nearest surface; differentiable in their ends.
+    """Distance from capsules to the nearest surface; differentiable with respect to their ends.
 
-    A capsule is what a sphere sweeps along a segment. The least `signed_distance` along the segment
-    is sought at places `CAPSULE_STEP` apart and then nearer and nearer to the best, so that it is
-    at most half a step too large.
+    A capsule is the volume that a sphere sweeps along a segment. The smallest `signed_distance` along
+    the segment is searched at points `CAPSULE_STEP` apart, and then refined near the best point. The
+    result is too large by at most half a step.
 
     Args:
         model: the map.
         starts: (..., D) centers of one end, world frame [m].
         ends: (..., D) centers of the other end [m].
-        radii: of the spheres [m], one, or (...).
+        radii: radii of the capsules [m], a number or (...).
 
     Returns:
         (...) float64 distances [m], negative in a collision.
@@ -154,14 +154,15 @@ def collision_probability(
 ) -> Tensor:
     """Probability that the nearest surface is nearer than a radius; differentiable.
 
-    P(distance < r) = Phi((r - m) / s), where m is the `signed_distance` to the mean of the hits and
-    s = sqrt((0.75 noise)^2 + (0.01 m)^2), with the standard deviation of the nearest face's hits as
-    noise. It accounts for what hits say about the surface, not for surfaces never seen.
+    P(distance < r) = Phi((r - m) / s). Phi is the normal distribution function, m is the
+    `signed_distance` to the mean of the hits, and s = sqrt((0.75 noise)^2 + (0.01 m)^2), where noise
+    is the standard deviation of the hits of the nearest face. Surfaces that were never observed are
+    not accounted for.
 
     Args:
         model: the map.
         points: (..., D) centers of spheres, world frame [m].
-        radii: of the spheres [m], one, or (...).
+        radii: radii of the spheres [m], a number or (...).
 
     Returns:
         (...) float64 probabilities; 0 where the map has no surface.
@@ -179,7 +180,7 @@ def collision_probability(
 
 @reads_map
 def body_collision_probability(model: OccupancyMap, body: Body, poses: TensorLike) -> Tensor:
-    """Probability that a body touches a surface: that of the sphere most likely to do so.
+    """Probability that a body touches a surface: the largest probability of its spheres.
 
     Args:
         model: the map.
@@ -187,7 +188,7 @@ def body_collision_probability(model: OccupancyMap, body: Body, poses: TensorLik
         poses: (..., D + 1, D + 1) ``world_from_body``.
 
     Returns:
-        (...) float64 probabilities, a lower bound, for the spheres may collide one by one.
+        (...) float64 probabilities. This is a lower bound, because any of the spheres may collide.
 
     Raises:
         ValueError: poses have another shape.

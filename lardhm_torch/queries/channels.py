@@ -10,20 +10,20 @@ from lardhm_torch.maps import OccupancyMap, TensorLike, channel_names
 
 
 def channel(model: OccupancyMap, points: TensorLike, name: str) -> Tensor:
-    """Interpolate a channel of a map: the local mean of the values of the hits, with gradients.
+    """Interpolate a channel of a map: the local mean of the values of the hits; differentiable.
 
-    The occupied clusters near a point are averaged with a power of their features, each with the
-    linear trend of its values (`channel_queries`). An unknown value is NaN: no occupied cluster with a
-    value is near.
+    This is a weighted mean over the nearest occupied clusters, each with the linear trend of its
+    values; weights are powers of the features (`channel_queries`). It is NaN where no occupied cluster
+    with a value is near.
 
     Args:
-        model: a map that was given channels (`LardHilbertMap.fit`).
+        model: a map with channels (see `LardHilbertMap.fit`).
         points: (..., D) world positions [m].
-        name: of the channel; "class": the probability of each class, in the order of
+        name: name of the channel; "class" gives the probability of each class, in the order of
             ``model.classes`` (`LardHilbertMap.class_probability`).
 
     Returns:
-        (...) values, or (..., C) of a channel with C values.
+        (...) values, or (..., C) for a channel with C values.
 
     Raises:
         ValueError: the map has no such channel.

@@ -27,8 +27,8 @@ from lardhm_torch.queries.nearest_face import (
 )
 
 MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
-LATTICE = 7  # points along each axis of a cluster at which the map is asked
-NEARLY = 0.5  # log-odds below those of an obstacle by no more count as one: it may lie in between
+LATTICE = 7  # points along each axis of a cluster at which the map is queried
+NEARLY = 0.5  # log-odds so little below those of an obstacle count, too: one may lie in between
 CHUNK_POINTS = 1 << 17
 
 
@@ -37,15 +37,16 @@ def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -
     """Lower bound on the distance to the nearest obstacle; differentiable.
 
     An obstacle is where the log-odds exceed those of the threshold by `EVIDENCE`, as for `raycast`.
-    The result is the larger one of two lower bounds.
+    The result is the larger of two lower bounds.
 
-    - At most k clusters contribute to an obstacle, so one of them contributes at least the k-th
-      part: it lies in the ellipsoid |inv(L) (x - c)| <= E of a cluster of positive weight w, with
-      E = sqrt(2 log(k w / log-odds)). The bound is the distance to plates around the ellipsoids.
-    - On a lattice over all these ellipsoids, the map tells where it has obstacles, or nearly has.
-      The bound is the distance to the `faces` of the map, made so thick that they contain them. It
-      is much tighter, but an obstacle smaller than the lattice, between two of its points, is not
-      seen.
+    - At most k clusters contribute to the log-odds of a point, so one of them contributes at least
+      1/k. Therefore an obstacle lies in the ellipsoid |inv(L) (x - c)| <= E of a cluster of positive
+      weight w, with E = sqrt(2 log(k w / log-odds)). The first bound is the distance to flat boxes
+      (plates) around the ellipsoids.
+    - The map is queried on a lattice over all these ellipsoids, to find points that are obstacles or
+      nearly so. The second bound is the distance to the `faces` of the map, made thick enough to
+      contain these points. It is much tighter, but an obstacle between points of the lattice can be
+      missed.
 
     Args:
         model: the map; a tiled map must fit in memory.
@@ -53,7 +54,7 @@ def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -
         threshold: probability of occupancy that counts as an obstacle, between 0.27 and 1.
 
     Returns:
-        (...) float64 [m]: at most the distance to the nearest obstacle, and 1-Lipschitz. Negative
+        (...) float64 distances [m], at most that to the nearest obstacle, and 1-Lipschitz. Negative
         where an obstacle is possible; infinite if the map has no obstacle.
 
     Raises:

@@ -19,9 +19,9 @@ class Mover:
     """Robot shape and hazard scale.
 
     Attributes:
-        radius: of a sphere [m]; 0 for a point.
-        length: path length over which log-odds of 1 are one expected obstacle [m]. Smaller is more
-            cautious.
+        radius: radius of a sphere [m]; 0 for a point.
+        length: length of a path with log-odds of 1 on which one obstacle is expected [m]. Smaller
+            values are more conservative.
         step: longest interval of a path that is tested only at its ends [m]; thinner obstacles can
             be missed. None: a quarter of `surface_step` for segments, all of it for rays.
     """
@@ -45,11 +45,11 @@ def segment_hazard(
 ) -> Tensor:
     """Expected number of obstacles that a mover meets along straight segments; differentiable.
 
-    This is the integral of the `hazard` along each segment, in closed form (`hazard` module). For a
-    point it is exact, except for obstacles thinner than a step. For a sphere, the largest hazard
-    among the paths of its center and of 3^D - 1 surface points counts. Each is exact, so the result
-    is a lower bound. `clearance` errs on the other side: where it is nowhere below the radius, the
-    sphere meets nothing. Gradients treat the nearest clusters as fixed, as those of the map do.
+    This is the integral of the `hazard` along each segment, computed numerically between sign changes
+    of the log-odds (see the module `hazard`). Obstacles thinner than a step can be missed. For a
+    sphere, the largest integral among the paths of its center and of 3^D - 1 surface points counts,
+    which is a lower bound. `clearance` is conservative instead: if it is nowhere below the radius, the
+    sphere meets no obstacle. Gradients treat the nearest clusters as fixed, as those of the map do.
 
     Args:
         model: the map.
@@ -113,9 +113,9 @@ def expected_range(
 ) -> Tensor:
     """Expected range of each ray; differentiable.
 
-    E[min(range, max_range)] = integral of exp(-Lambda(t)) from 0 to max_range, where Lambda(t) is
-    the hazard up to t, as `segment_hazard` has it, by the trapezoidal rule. Probabilities below
-    0.0001 count as 0.
+    E[min(range, max_range)] = integral of exp(-Lambda(t)) from 0 to max_range. Lambda(t) is the
+    expected number of obstacles up to t (see `segment_hazard`), computed by the trapezoidal rule.
+    Probabilities below 0.0001 count as 0.
 
     Args:
         model: the map.

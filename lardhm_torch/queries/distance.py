@@ -24,17 +24,17 @@ def signed_distance(
     *,
     to_mean: bool = False,
 ) -> Tensor:
-    """Distance to the nearest surface, negative behind it; differentiable in the points.
+    """Distance to the nearest surface, negative behind it; differentiable with respect to the points.
 
-    The surface consists of flat `faces` where the hits lie, and of kept hits that are near none. The
-    distance is negative where the nearest face is seen from behind and the map does not hold the
-    point to be free (log-odds below -1): inside of obstacles, and in the unknown space behind a wall
-    that was seen from one side only. A face seen obliquely from behind, from farther beside than
-    below it, counts as seen from its front.
+    The surface consists of flat `faces` where the hits lie, and of kept hits far from all faces. The
+    distance is negative for points behind the nearest face that the map does not predict as free
+    (log-odds below -1): inside obstacles, and in the unknown space behind a wall that was observed
+    from one side only. A point that is farther to the side of a face than behind it counts as in
+    front of it.
 
-    Faces lie one standard deviation of the hits in front of their mean, because the nearest of noisy
-    hits is in front of the surface. With ``to_mean`` the distance is greater by that: without bias
-    where the noise is that of the sensor.
+    Faces lie one standard deviation of the hits in front of their mean, because the nearest of the
+    noisy hits is in front of the surface. With ``to_mean`` this standard deviation is added, which
+    makes the distance unbiased if the spread of the hits is due to the noise of the sensor.
 
     Unlike `clearance`, this is an estimate, not a bound. The gradient has length 1, and is 0 where
     nothing is nearer than ``max_distance``.
@@ -42,8 +42,8 @@ def signed_distance(
     Args:
         model: the map.
         points: (..., D) world positions [m].
-        max_distance: result where no surface is nearer [m]; a finite one saves time.
-        to_mean: to the mean of the hits instead of to the nearest of them.
+        max_distance: result where no surface is nearer [m]; a finite value saves time.
+        to_mean: return the distance to the mean of the hits instead of that to the nearest of them.
 
     Returns:
         (...) distances in the dtype of the points, float64 for arrays and lists [m]; NaN for a
@@ -69,7 +69,7 @@ def signed_distance(
 def surface_distance(
     model: OccupancyMap, points: TensorLike, max_distance: float = math.inf
 ) -> Tensor:
-    """Distance to the nearest surface, on either side of it: the size of `signed_distance`.
+    """Unsigned distance to the nearest surface: the absolute value of `signed_distance`.
 
     Args:
         model: the map.

@@ -30,17 +30,17 @@ def information_gain(
     max_range: float,
     resolution: float = 0.1,
 ) -> float:
-    """Expected information gain of a view: the entropy of the space that its rays see.
+    """Expected information gain of a view: the entropy of the space that its rays observe.
 
-    The unit is a cell of `CELL` = 0.1 m: an unknown one that is seen for sure gains 1 bit. A ray
-    gains along its length
+    Space is measured in cells of `CELL` = 0.1 m; an unknown cell that is certainly observed gains
+    1 bit. In general, a ray gains in each cell along it
 
         g(p) = (H(p) - H(0.98)) / (1 - H(0.98)), at least 0, H(p) = -p log2 p - (1 - p) log2(1 - p)
 
-    per cell, times the probability to get there by the hazard, with a length of `SIGHT_LENGTH`.
-    H(0.98) is what measured space keeps. Unknown space has no hazard, so sensors see into it. Where
-    neighboring rays are closer than a cell, each gains in proportion to its part of the cell; rays
-    in the same direction count once.
+    times the probability that it gets there. H(0.98) is the entropy that remains in measured space.
+    A ray is blocked at the `hazard` rate with a length of `SIGHT_LENGTH`. Unknown space has no hazard,
+    so rays pass through it. Where neighboring rays are closer than a cell, each gains in proportion
+    to its part of the cell; rays in the same direction count once.
 
     Args:
         model: the map.

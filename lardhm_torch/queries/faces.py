@@ -1,13 +1,13 @@
 """The surface of a map as flat faces: one for each side of an occupied cluster.
 
-The hits of a cluster lie in a plate: its plane goes through their mean, across their direction of
-least variance. A plate has a face on each side from which it was seen, one standard deviation of the
-hits in front of their mean: nearest hits are that far in front of the mean of noisy hits. Its edges
-are those of hits spread evenly. It ends earlier where the log-odds fall, and counts only if the map
-holds its center to be occupied. Hits that a cluster keeps, and that no face comes near, are faces without
-an extent: stray hits, and those beyond the edges.
+The hits of a cluster lie in a plate: a plane through their mean, normal to their direction of least
+variance. A plate has a face on each side from which it was observed. The face lies one standard deviation
+of the hits in front of their mean, because the nearest of noisy hits are about that far in front of it.
+Its edges are those of uniformly distributed hits, or where the log-odds fall. A plate counts only if the
+map predicts that its center is occupied. Kept hits far from all faces, such as stray hits and those
+beyond the edges, are faces without an extent.
 
-The faces of a map are kept. After an update only those near changed clusters are made again.
+The faces of a map are cached. After an update only those near changed clusters are recomputed.
 """
 
 from __future__ import annotations

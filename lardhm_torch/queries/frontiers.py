@@ -41,7 +41,7 @@ def frontiers(
 
     Points with log-odds below -1 are free, above 1 occupied, and unknown otherwise. Log-odds pass
     through 0 between free space and a wall, so unknown points within ``wall_margin`` of an occupied
-    point are ignored. The grid is never held in memory: slabs of it are queried one after another.
+    point are ignored. The grid is queried in slabs, so it need not fit in memory.
 
     Args:
         model: the map.
@@ -51,7 +51,7 @@ def frontiers(
         wall_margin: width of the ignored layer around obstacles [m].
 
     Returns:
-        points and groups; grid points that touch, also diagonally, are in one group.
+        points and groups; neighboring grid points, also diagonal ones, are in one group.
 
     Raises:
         ValueError: as for `grid`; the corners do not have the dimension of the map; or wall_margin is

@@ -114,7 +114,7 @@ def grid_axes(
 def query_grid(
     model: OccupancyMap, lower: TensorLike, upper: TensorLike, resolution: float
 ) -> Tensor:
-    """Probability at all points of `grid`, which are never held in memory at once.
+    """Probability at all points of `grid`, without the memory for all points at once.
 
     Args:
         model: the map.

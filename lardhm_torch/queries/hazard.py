@@ -2,12 +2,12 @@
 
 Obstacles occur along a path like the events of a Poisson process with rate
 lambda(x) = max(log-odds(x), 0) / length [1/m]. The path is free with probability
-exp(-integral of lambda). Free and unknown space have no hazard. A sphere meets along its path what
-the worst of its center and points spread over its surface meets along its own.
+exp(-integral of lambda). Free and unknown space have no hazard. The integral for a sphere is the
+largest among the paths of its center and of points spread over its surface.
 
-The log-odds along a line are smooth, because neighbors fade out before others replace them. Between
-the places where they change sign, which are found by bisection, a Gauss-Legendre quadrature with a
-few nodes per step integrates them. Its weights are positive, so that no hazard is negative.
+The log-odds along a line are smooth, because neighbors fade out before others replace them. They are
+integrated between sign changes, which are found by bisection, by Gauss-Legendre quadrature with a
+few nodes per step. Its weights are positive, so the result is never negative.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def hazard(model: OccupancyMap, points: TensorLike, *, length: float = HAZARD_LE
     Args:
         model: the map.
         points: (..., D) world positions [m].
-        length: path length over which log-odds of 1 are one expected obstacle [m].
+        length: length of a path with log-odds of 1 on which one obstacle is expected [m].
 
     Returns:
         (...) rates [1/m], differentiable.

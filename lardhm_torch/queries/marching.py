@@ -1,4 +1,4 @@
-"""Many rays that go forward together, some steps at a time, until next to nothing gets farther."""
+"""Ray marching of many rays together, some steps at a time, until almost no ray gets farther."""
 
 from __future__ import annotations
 

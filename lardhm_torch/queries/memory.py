@@ -9,7 +9,7 @@ CONTROL_GROUP = Path("/sys/fs/cgroup")  # limits of containers
 
 
 def available_memory() -> int | None:
-    """Bytes that this process may still allocate; None where the system does not say."""
+    """Bytes that this process can still allocate; None if the system does not report it."""
     found = []
     try:
         lines = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())

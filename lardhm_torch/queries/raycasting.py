@@ -1,7 +1,7 @@
 """Ray casting: distance to the first obstacle along each ray.
 
-This is the definition, in plain torch: it evaluates every step of every ray. The native kernel gives
-the same ranges and passes over cells of an octree in which no obstacle can be.
+This is the definition, in plain torch: it evaluates every step of every ray. The native library gives
+the same ranges, but skips cells of an octree that cannot contain an obstacle.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def unit_rays(
         raise ValueError(f"directions must be (R, {model.dim}); got {tuple(directions.shape)}")
     if tuple(origins.shape) not in (tuple(directions.shape), (model.dim,)):
         raise ValueError(
-            f"origins must be {tuple(directions.shape)} as the directions, or one ({model.dim},); "
+            f"origins must be {tuple(directions.shape)} like the directions, or one ({model.dim},); "
             f"got {tuple(origins.shape)}"
         )
     lengths = torch.linalg.vector_norm(directions, dim=1, keepdim=True)

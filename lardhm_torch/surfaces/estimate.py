@@ -1,4 +1,4 @@
-"""Area, faces and memory of a mesh, estimated from the clusters before the work."""
+"""Estimates of the area, faces and memory of a mesh, from the clusters."""
 
 from __future__ import annotations
 

@@ -61,11 +61,11 @@ def extract_mesh(
       because free space is learned only up to some centimeters before the hits. It encloses
       everything occupied, which is conservative for a robot.
 
-    A face stands only where something was measured behind it and free space in front of it: within
-    three standard deviations of the nearest supporting cluster (its smallest), the log-odds must
+    A face is kept only if there is measured occupied space behind it and free space in front of it.
+    Within three standard deviations (the smallest) of the nearest supporting cluster, the log-odds must
     exceed those of the threshold by ``evidence`` behind each vertex, and fall below them by twice as
-    much in front. Otherwise there would be sheets in unmeasured space, where the log-odds vary around
-    0, and backs of walls. This rule does not depend on the resolution.
+    much in front. Without this rule, there would be faces in unmeasured space, where the log-odds vary
+    around 0, and on the backs of walls. The rule does not depend on the resolution.
 
     Args:
         model: a 3-D map.
@@ -80,8 +80,8 @@ def extract_mesh(
             map ("color", "intensity", "class", ...; gray where it is unknown), or None. Meshes
             colored by class have the class numbers as vertex attribute "label", -1 where unknown,
             which `save_mesh` writes to .ply.
-        evidence: log-odds required on both sides of a face, see above; None keeps all faces, which
-            takes time and memory in proportion to the volume.
+        evidence: margin of the log-odds required on both sides of a face, see above; None keeps all
+            faces, which takes time and memory in proportion to the volume.
         progress: show a progress bar.
 
     Returns:

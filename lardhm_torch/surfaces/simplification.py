@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 def simplify_mesh(mesh: trimesh.Trimesh, num_faces: int) -> trimesh.Trimesh:
     """Simplify a mesh to about ``num_faces`` faces. Flat parts get large faces.
 
-    A closed mesh usually stays closed. Vertices get color and label of the nearest vertex before.
+    A closed mesh usually stays closed. Vertices get the color and label of the nearest old vertex.
 
     Args:
         mesh: the mesh [m].
-        num_faces: number of faces to leave.
+        num_faces: target number of faces.
 
     Returns:
-        A new mesh; the same one if it has no more faces than that.
+        A new mesh, or the given mesh if it has no more faces than that.
 
     Raises:
         ValueError: num_faces is below 1.

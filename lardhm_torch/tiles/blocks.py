@@ -1,4 +1,4 @@
-"""Blocks of tiles: cubes of a few tiles, each answered by one map; points are grouped by block."""
+"""Blocks of tiles: cubes of a few tiles, each queried as one map; points are grouped by block."""
 
 from __future__ import annotations
 

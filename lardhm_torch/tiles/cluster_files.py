@@ -103,7 +103,7 @@ def _as_clusters(table: NDArray[Any], like: Tensor) -> TileClusters:
 def _table(path: Path, like: Tensor) -> NDArray[Any]:
     found = _read(path, like)
     if found is None:
-        raise ValueError(f"{path} must hold the clusters of a tile, whole: fit the tiles again")
+        raise ValueError(f"{path} must hold all clusters of a tile: fit the tiles again")
     return found[1]
 
 

@@ -25,15 +25,15 @@ from lardhm_torch.tiles.records import record_type
 
 
 def join_folders(first: Folder, second: Folder, target: Folder) -> Manifest:
-    """Copy the training points of two folders, and the fitted tiles that stay valid, to a new one.
+    """Copy the training points of two folders, and the tiles that remain valid, to a new folder.
 
-    A fitted tile stays valid if neither it nor a tile that touches it contains points of the other
+    A fitted tile remains valid if neither it nor a tile that touches it contains points of the other
     folder; `fit_tiles` fits the others. Both folders are left unchanged.
 
     Args:
-        first: gives seed and settings.
-        second: must have the same world frame, edge, halo, kernel, sampling and fitting.
-        target: is created; must be new or empty.
+        first: a folder, whose seed and settings are used.
+        second: a folder with the same world frame, edge, halo, kernel, sampling and fitting settings.
+        target: the new folder, which must not exist or be empty.
 
     Returns:
         The manifest of the new folder.

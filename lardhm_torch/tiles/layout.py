@@ -1,13 +1,13 @@
-"""Which tiles are needed to answer in a box as the whole map would.
+"""Which tiles are needed so that queries in a box give the results of the whole map.
 
-Only the k nearest clusters contribute at a point. A box is answered as by the whole map if all
-clusters whose centers are within a radius r of it are loaded, and one of these holds:
+Only the k nearest clusters contribute at a point. Queries in a box give the results of the whole map
+if all clusters whose centers are within a radius r of the box are loaded, and one of these is true:
 
 - *r is the largest support radius of the tiles that contribute in the box.* A cluster farther away
   contributes less than `entries.NEGLIGIBLE`. The k nearest of the loaded centers and the k nearest
   of all centers have the same members within r; their other members contribute at most k times that.
-- *Every point of the box is known to have k centers within r.* Then its k nearest centers are
-  loaded, and the answers are equal up to rounding.
+- *Every point of the box has at least k centers within r.* Then its k nearest centers are loaded, and
+  the results are equal up to rounding.
 
 Both radii follow from the bounds, cluster counts and support radii in the manifest, so that no tile
 has to be opened. They are computed for tile-sized cells of the box, and the smaller one is used:
@@ -112,7 +112,7 @@ def _block_tiles(indices: list[Index], counts: Tensor, manifest: Manifest) -> in
 
 
 def needed_tiles(layout: Layout, lower: Tensor, upper: Tensor) -> Tensor:
-    """(S,) rows of the tiles that together answer in a box (D,) to (D,) as the whole map would."""
+    """(S,) rows of the tiles that suffice for queries in a box (D,) to (D,)."""
     gap = _gap(lower[None], upper[None], layout.lower, layout.upper)[0]
     contributes = gap <= layout.radius + _SLACK
     if not bool(contributes.any()):

@@ -1,8 +1,8 @@
-"""The ledger of a tiled folder: how many training points of each tile count.
+"""The ledger of a tiled folder: the number of valid training points of each tile.
 
-Files of training points only grow. Records behind those that the ledger counts were left by a
-killed run; the next writer truncates them. The files are not forced to the disk (that would take
-milliseconds for each tile): one that a power failure truncated is recognized by its size.
+Files of training points only grow. Records after the valid ones were left by a killed run; the next
+writer truncates them. The files are not synchronized to disk (that would take milliseconds for each
+tile): a file that was truncated by a power failure is recognized by its size.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def read_ledger(folder: Folder) -> Ledger:
         channels = check_layout(body.get("channels", {}))
         return Ledger(**{**body, "tiles": tiles, "values": values, "channels": channels})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path} must be the ledger of a tiled map, whole; {error}") from error
+        raise ValueError(f"{path} must be the complete ledger of a tiled map; {error}") from error
 
 
 @contextmanager
@@ -121,7 +121,7 @@ def appending(folder: Folder, dim: int) -> Iterator[Ledger]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise ValueError(
-                f"{folder} must have one writer at a time; another process adds points to it"
+                f"{folder} must have one writer at a time; another process is adding points to it"
             ) from error
         try:
             yield _roll_back(folder, dim)

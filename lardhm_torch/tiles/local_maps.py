@@ -16,7 +16,7 @@ from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore
 
 
 class LocalMaps:
-    """Maps that answer in blocks and boxes of a tiled map (see `layout`).
+    """Maps that are valid in blocks and boxes of a tiled map (see `layout`).
 
     Args:
         store: reads the tiles.
@@ -38,7 +38,7 @@ class LocalMaps:
         return self._blocks.find(index)
 
     def of_block(self, number: int, points: Tensor) -> LardHilbertMap:
-        """The map that answers in a block.
+        """The map that is valid in a block.
 
         Args:
             number: from `block_numbers`.
@@ -51,7 +51,7 @@ class LocalMaps:
         return self._joined_map(self._block_rows[number], points)
 
     def of_box(self, lower: Tensor, upper: Tensor) -> LardHilbertMap:
-        """The map that answers in a box (D,) to (D,) [m]: that of a block if it contains the box."""
+        """The map that is valid in a box (D,) to (D,) [m]: that of a block if it contains the box."""
         corners = torch.stack([lower, upper])
         first, last = tile_indices(corners, self.layout.origin, self.layout.block_edge)
         number = int(self._blocks.find(first[None])[0])
@@ -60,7 +60,7 @@ class LocalMaps:
         return self._joined_map(needed_tiles(self.layout, lower, upper), corners)
 
     def merged(self, bounds: tuple[Tensor, Tensor] | None) -> LardHilbertMap:
-        """A new map, not cached, that answers in a box (D,) to (D,), or everywhere."""
+        """A new map, not cached, that is valid in a box (D,) to (D,), or everywhere."""
         if bounds is None:
             return self._join(list(self._tiles()), self.origin)
         rows = needed_tiles(self.layout, *bounds)

@@ -179,7 +179,7 @@ def read_page(path: Path) -> dict[str, Any]:
     try:
         page = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"it must be JSON, whole; {error}") from error
+        raise ValueError(f"it must be complete JSON; {error}") from error
     version = page.get("format_version") if isinstance(page, dict) else None
     if version != FORMAT_VERSION or isinstance(version, bool):
         raise ValueError(

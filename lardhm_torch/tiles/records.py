@@ -59,7 +59,7 @@ def record_type(dim: int) -> np.dtype[Any]:
 
 
 def route(points: Tensor, labels: Tensor, grid: Grid) -> Iterator[tuple[Index, Records]]:
-    """Records of labelled points for each tile that contains them or has them in its halo.
+    """Records of labeled points for each tile that contains them or has them in its halo.
 
     Args:
         points: (N, D) world positions [m].

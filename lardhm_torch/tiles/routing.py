@@ -1,4 +1,4 @@
-"""Scans of any length to training points of tiles on disk, one piece of the scans at a time."""
+"""Write the training points of scans of any length to tiles on disk, one piece at a time."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def tile_scans(
 
     Args:
         pieces: scans in pieces that fit in memory (`lardhm_torch.io.scan_files.iter_pieces`).
-        folder: is created; must not hold a complete tiled map.
+        folder: created if missing; must not contain a complete tiled map.
         config: edge, halo, seed, sampling.
         progress: show a progress bar on a terminal.
 

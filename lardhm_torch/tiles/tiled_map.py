@@ -1,4 +1,4 @@
-"""A map too large for memory: a folder of tiles that answers as one map would."""
+"""A map too large for memory: a folder of tiles that is queried like one map."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ Corner = Tensor | Sequence[float]
 
 
 class TiledMap:
-    """A map in a folder of tiles. It answers like the `LardHilbertMap` of all tiles together.
+    """A map stored as a folder of tiles. Queries give the same results as one map of all tiles.
 
-    Query points are grouped by blocks of a few tiles. A block is answered by a map of its own tiles
-    and of all others that contribute there (`layout` explains why the answers are those of the
+    Query points are grouped by blocks of a few tiles. For each block, a map of its own tiles and of
+    all others that contribute there is loaded (`layout` explains why the results are those of the
     whole map). Tiles and maps stay in memory up to a limit; the least recently used are dropped.
     Where no tile contributes, nothing is read and the probability is 1/2.
 
-    A damaged tile raises `DamagedTileError` where its clusters may contribute; elsewhere the map
-    answers as before. With ``skip_damaged``, a warning is issued and the tile is treated as empty.
+    A damaged tile raises `DamagedTileError` in queries where its clusters may contribute; other
+    queries work as before. With ``skip_damaged``, a warning is issued and the tile is treated as empty.
 
-    `merge` gives an ordinary map of all tiles or of a box. The attributes `weights`, `centers`,
+    `merge` returns an ordinary map of all tiles or of a box. The attributes `weights`, `centers`,
     `raw_scale_tril`, `scale_tril`, `is_occupied` and `counts` are those of the whole map, which
     must then fit the memory limit.
 
@@ -49,7 +49,7 @@ class TiledMap:
         manifest: its manifest.
         memory_limit: bytes of clusters in memory at a time.
         skip_damaged: issue a warning for damaged tiles and continue without them.
-        device: device of the answers; None: the CPU.
+        device: device of the results; None: the CPU.
 
     Raises:
         ValueError: memory_limit is not > 0.
@@ -99,7 +99,7 @@ class TiledMap:
             folder: folder of the tiled map.
             memory_limit: bytes of clusters in memory at a time.
             skip_damaged: issue a warning for damaged tiles and continue without them.
-            device: device of the answers; None: the CPU.
+            device: device of the results; None: the CPU.
 
         Raises:
             FileNotFoundError: the folder has no manifest.
@@ -114,8 +114,8 @@ class TiledMap:
     def split(model: LardHilbertMap, folder: Folder, edge: float) -> TiledMap:
         """Write an ordinary map as a folder of tiles, and open it.
 
-        A cluster belongs to the tile that contains its center. Nothing is rounded: `merge` gives
-        the map back, with its clusters in the order of the tiles.
+        A cluster belongs to the tile that contains its center. Nothing is rounded: `merge` returns
+        the same map, with its clusters in the order of the tiles.
 
         Args:
             model: a fitted map.
@@ -124,7 +124,7 @@ class TiledMap:
 
         Raises:
             ValueError: the map is empty, or edge is not > 0.
-            FileExistsError: the folder holds a tiled map already.
+            FileExistsError: the folder already contains a tiled map.
         """
         split_map(model, folder, edge)
         return TiledMap.open(folder)
@@ -170,7 +170,7 @@ class TiledMap:
 
     @property
     def channel_layout(self) -> Layout:
-        """Names of the channels, with what each has (`channel_sums`)."""
+        """Names of the channels, with the layout of each (`channel_sums`)."""
         return dict(self.manifest.channels)
 
     @property
@@ -233,7 +233,7 @@ class TiledMap:
         return self._local.tile_maps()
 
     def merge(self, bounds: tuple[Corner, Corner] | None = None) -> LardHilbertMap:
-        """An ordinary map, in memory, that answers in a box as this map does.
+        """An ordinary map, in memory, that equals this map in a box.
 
         Args:
             bounds: lower and upper corner (D,) of the box, world frame [m]; None: everywhere.
@@ -259,7 +259,7 @@ class TiledMap:
 
     @torch.no_grad()
     def local_parts(self, lower: Tensor, upper: Tensor) -> Iterator[tuple[Tensor, LardHilbertMap]]:
-        """Groups of boxes that are near each other, and the map that answers in each group.
+        """Groups of boxes that are near each other, and a map that is valid in each group.
 
         Args:
             lower: (N, D) lower corners of the boxes, world frame [m].
@@ -286,7 +286,7 @@ class TiledMap:
         answer: Callable[[LardHilbertMap, Tensor], Tensor],
         unknown: float | Tensor,
     ) -> Tensor:
-        """Answers of the blocks' maps at (..., D) points; ``unknown`` where no tile contributes."""
+        """Results of the blocks' maps at (..., D) points; ``unknown`` where no tile contributes."""
         unknown = torch.as_tensor(unknown, dtype=self._dtype, device=self.origin.device)
         points = torch.as_tensor(points, device=self.origin.device)
         check_points(points, self.dim)

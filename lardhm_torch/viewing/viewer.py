@@ -38,8 +38,8 @@ class ViewConfig:
     """Settings of the viewer.
 
     Attributes:
-        host: address to serve at; "0.0.0.0" accepts other machines.
-        port: TCP port; the next free one if it is taken.
+        host: address to serve on; "0.0.0.0" accepts connections from other machines.
+        port: TCP port; if it is in use, the next free one is used.
         resolution: edge of the cells of the surface [m]; None: chosen by `scene.view_resolution`.
         max_points: limit for the scan points; above it, one point per voxel is shown.
     """
@@ -60,8 +60,8 @@ class MapViewer:
     """Serve a page that shows a map. Surfaces are extracted in a background thread.
 
     Args:
-        model: a map of 2 or 3 dimensions with clusters; later changes are shown by `update`.
-        scans: also shown, as points and sensor positions.
+        model: a map of 2 or 3 dimensions with clusters; call `update` to show later changes.
+        scans: scans to show as points and sensor positions.
         config: address and resolution.
 
     Raises:
@@ -131,7 +131,7 @@ class MapViewer:
             partial.write_bytes(content)
 
     def close(self) -> None:
-        """Stop the thread and the server; what is being drawn is given up."""
+        """Stop the thread and the server, even while a surface is extracted."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

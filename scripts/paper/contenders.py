@@ -35,7 +35,7 @@ CANDIDATES: dict[str, list[tuple[Any, ...]]] = {
 }
 MEANING = {
     "Original HM": "cell {} m, lengthscale {} cells",
-    "Local GP": "{} points a process, k = {}",
+    "Local GP": "{} points per process, k = {}",
     "OctoMap": "voxel {} m",
 }
 VALIDATION_SHARE = 0.2
