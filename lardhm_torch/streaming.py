@@ -22,7 +22,13 @@ from lardhm_torch.learning import packing
 from lardhm_torch.learning.clustering import scan_clusters, split_labels
 from lardhm_torch.learning.update import UpdateConfig
 from lardhm_torch.native.thinning import few_per_cell
-from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays, spread_rows
+from lardhm_torch.sampling import (
+    NoUsableRayError,
+    Samples,
+    SamplingConfig,
+    sample_rays,
+    spread_rows,
+)
 from lardhm_torch.scans import Scans, seeded_generator
 
 

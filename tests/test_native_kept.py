@@ -92,7 +92,8 @@ def test_sums_of_features(both, dtype, dim):
     wanted = torch.arange(300) % 3 > 0
     fast, plain = both(feature_sums, points, centers, raw, wanted, KERNEL, index)
     torch.testing.assert_close(fast, plain, rtol=1e-4, atol=1e-4)
-    assert (fast[wanted] > 0).any() and not (fast[~wanted] > 0).any()
+    assert (fast[wanted] > 0).any()
+    assert not (fast[~wanted] > 0).any()
     assert feature_sums(points[:0], centers, raw, wanted, KERNEL, index).abs().sum() == 0
 
 
@@ -105,7 +106,8 @@ def test_points_are_added_as_if_all_had_come_at_once(both, dtype, dim):
     cleared = torch.arange(CLUSTERS + 3) % 5 == 0
     given = (found, cleared, more, of_more)
     (fast, new), (plain, plain_new) = both(evidence.add_points, *given)
-    assert torch.equal(fast, plain) and torch.equal(new, plain_new)
+    assert torch.equal(fast, plain)
+    assert torch.equal(new, plain_new)
     stays = ~cleared[owners]
     rows = torch.cat([points[stays], more])
     whole = keep_points(rows, torch.cat([owners[stays], of_more]), CLUSTERS + 3)
@@ -155,7 +157,8 @@ def test_losses_in_excess_of_a_perfect_prediction(ops, monkeypatch, dtype):
     fast = excess_losses(indices, values, labels, weights)
     monkeypatch.setattr(native, "descends", lambda *_: False)
     torch.testing.assert_close(fast, excess_losses(indices, values, labels, weights))
-    assert bool((fast > -1e-6).all()) and fast.max() > 1
+    assert bool((fast > -1e-6).all())
+    assert fast.max() > 1
 
 
 def test_opcheck_accepts_the_operators_of_kept_points(ops):

@@ -38,7 +38,7 @@ from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
-MANY = 0.25
+MANY = 0.25  # new points relative to the kept ones, above which the points of a cluster are regrouped
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 
@@ -280,7 +280,7 @@ def _unseen(groups: Groups, points: Tensor, owners: Tensor, joined: Tensor) -> T
 def _reassigned(
     groups: Groups, points: Tensor, owners: Tensor, alive: Tensor, num_known: int, floor: float
 ) -> MapState:
-    """Clusters after all points of changed ones and new points went to the nearest center."""
+    """Clusters after new points and all points of changed clusters went to the nearest centers."""
     state, evidence, changed = groups.state, groups.evidence, groups.changed
     moving, homes = kept_points(evidence, changed[: len(evidence)].nonzero().squeeze(1))
     moving, homes = torch.cat([points, moving]), torch.cat([owners, homes])

@@ -48,7 +48,7 @@ class UpdateConfig:
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance between merged clusters in Algorithm 2
     split_loss: float = 0.01  # clusters whose points have a larger mean log-loss are divided
-    cell_edge: float = 0.1  # [m] at most 4 new points of each class in a cell of this edge are used
+    cell_edge: float = 0.1  # [m] in a cell of this edge, at most 4 new points of a class are used
     max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
     max_trained: int = 5_000  # maximum number of changed clusters to train; the others follow later
     fit: FitConfig = UPDATE_FIT
@@ -138,15 +138,16 @@ def _without(nearby: Tensor, part: MapState, alive: Tensor) -> Changes:
 def _thinned(
     points: Tensor, labels: Tensor, config: UpdateConfig, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """A few samples of each label in each cell, and of these a stratified random subset if there are more.
+    """A few samples of each label in each cell, and a stratified random subset of many.
 
-    The samples of a scan are dense near the sensor. Evenly spread ones train the map better.
+    The samples of a scan are dense near the sensor and on close surfaces; the map is as accurate without
+    most of those. Cells of free points are half as large, because free points fill space.
     """
-    chosen = few_per_cell(points, (2 * labels).long(), config.cell_edge)
-    points, labels = points.index_select(0, chosen), labels.index_select(0, chosen)
+    edges = {1.0: config.cell_edge, 0.0: config.cell_edge / 2, UNKNOWN: config.cell_edge}
     rows, limit = [], config.max_points
-    for label in (1.0, 0.0, UNKNOWN):
+    for label, edge in edges.items():
         own = (labels == label).nonzero().squeeze(1)
+        own = own[few_per_cell(points.index_select(0, own), torch.zeros_like(own), edge)]
         rows.append(own[spread_rows(len(own), limit, rng)] if len(own) > limit else own)
     chosen = torch.cat(rows)
     return points.index_select(0, chosen), labels.index_select(0, chosen)
