@@ -27,10 +27,8 @@ def test_an_update_uses_few_points_of_each_class_in_a_cell():
     labels = torch.tensor([1.0, 0.0, 0.5]).repeat(300)
     config = UpdateConfig(cell_edge=0.5)
     kept, of_kept = _thinned(points, labels, config, generator())
-    for label in (0.5, 1.0):
+    for label in (0.0, 0.5, 1.0):
         assert int((of_kept == label).sum()) == 8 * PER_CELL
-    _, offered = (4 * points[labels == 0]).floor().unique(dim=0, return_counts=True)
-    assert int((of_kept == 0).sum()) == int(offered.clamp(max=PER_CELL).sum()) < 300
     fewer, of_fewer = _thinned(
         points, labels, UpdateConfig(cell_edge=0.5, max_points=9), generator()
     )

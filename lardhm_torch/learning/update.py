@@ -141,13 +141,14 @@ def _thinned(
     """A few samples of each label in each cell, and a stratified random subset of many.
 
     The samples of a scan are dense near the sensor and on close surfaces; the map is as accurate without
-    most of those. Cells of free points are half as large, because free points fill space.
+    most of those.
     """
-    edges = {1.0: config.cell_edge, 0.0: config.cell_edge / 2, UNKNOWN: config.cell_edge}
     rows, limit = [], config.max_points
-    for label, edge in edges.items():
+    for label in (1.0, 0.0, UNKNOWN):
         own = (labels == label).nonzero().squeeze(1)
-        own = own[few_per_cell(points.index_select(0, own), torch.zeros_like(own), edge)]
+        own = own[
+            few_per_cell(points.index_select(0, own), torch.zeros_like(own), config.cell_edge)
+        ]
         rows.append(own[spread_rows(len(own), limit, rng)] if len(own) > limit else own)
     chosen = torch.cat(rows)
     return points.index_select(0, chosen), labels.index_select(0, chosen)
