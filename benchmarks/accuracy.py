@@ -19,6 +19,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,15 @@ from conditions import ROOT, conditions, describe, write_json
 from torch import Tensor
 from tqdm import tqdm
 
-from lardhm_torch import LardHilbertMap, Scans, load_scans, sample_rays, split_rays
+from lardhm_torch import (
+    FitConfig,
+    LardHilbertMap,
+    Scans,
+    load_scans,
+    sample_rays,
+    scan_disagreement,
+    split_rays,
+)
 from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
 from lardhm_torch.evaluation.held_out import evaluate, protocol_rays
 
@@ -45,26 +54,31 @@ BEST = "OctoMap, best of each"
 LOWER_IS_BETTER = ("log_loss", "brier", "ece", "unknown")
 
 
-def lard_hilbert_map(train: Scans, seed: int) -> Model:
-    """A map with default settings."""
+def lard_hilbert_map(train: Scans, seed: int, *, is_blurred: bool = False) -> Model:
+    """A map with default settings, or as by ``lardhm fit --hit-noise auto``."""
     samples = sample_rays(train, seed=seed)
-    model = LardHilbertMap(dim=train.dim).fit(samples.points, samples.labels, seed=seed)
-    return model
+    config = FitConfig(hit_noise=scan_disagreement(train) if is_blurred else 0.0)
+    model = LardHilbertMap(dim=train.dim)
+    return model.fit(samples.points, samples.labels, seed=seed, config=config)
 
 
 @torch.enable_grad()
-def tuned_hilbert_map(train: Scans, seed: int) -> Model:
-    """A fine-tuned map, as by ``lardhm fit --tune``."""
-    from lardhm_torch import fine_tune
+def tuned_hilbert_map(train: Scans, seed: int, *, is_blurred: bool = False) -> Model:
+    """A fine-tuned map, as by ``lardhm fit --tune`` and, if wanted, ``--hit-noise auto``."""
+    from lardhm_torch import TuneConfig, fine_tune
 
     samples = sample_rays(train, seed=seed)
-    model = LardHilbertMap(dim=train.dim).fit(samples.points, samples.labels, seed=seed)
+    noise = scan_disagreement(train) if is_blurred else 0.0
+    config = FitConfig(hit_noise=noise)
+    model = LardHilbertMap(dim=train.dim)
+    model.fit(samples.points, samples.labels, seed=seed, config=config)
     fine_tune(
         model,
         samples.points,
         samples.labels,
         resample=lambda epoch: sample_rays(train, seed=seed + epoch),
         seed=seed,
+        config=TuneConfig(hit_noise=noise),
     )
     return model
 
@@ -74,13 +88,19 @@ def octomap(resolution: float) -> System:
     return lambda train, seed: OctoMapBaseline(resolution).fit(train)
 
 
-def choose_systems(names: list[str], resolutions: tuple[float, ...]) -> dict[str, System]:
+def choose_systems(
+    names: list[str], resolutions: tuple[float, ...], is_blurred: bool
+) -> dict[str, System]:
     """Return the systems named on the command line, in the order of the table."""
     systems: dict[str, System] = {}
-    if "map" in names:
-        systems["LARD-HM"] = lard_hilbert_map
-    if "tuned" in names:
-        systems["LARD-HM tuned"] = tuned_hilbert_map
+    for name, title, build in (
+        ("map", "LARD-HM", lard_hilbert_map),
+        ("tuned", "LARD-HM tuned", tuned_hilbert_map),
+    ):
+        if name in names:
+            systems[title] = build
+            if is_blurred:
+                systems[f"{title}, hit noise"] = partial(build, is_blurred=True)
     if "octomap" in names:
         systems |= {f"OctoMap {edge} m": octomap(edge) for edge in resolutions}
     return systems
@@ -158,7 +178,7 @@ def best_scores(tables: list[Scores]) -> Scores:
 def format_set(name: str, result: dict[str, Any]) -> str:
     """Text table of one set with one row per system; a cell holds unif / near."""
     heads = "".join(column.rjust(18) for column in COLUMNS)
-    lines = [f"{name} ({result['rays']} rays); unif / near", " " * 24 + heads + "   train [s]"]
+    lines = [f"{name} ({result['rays']} rays); unif / near", " " * 28 + heads + "   train [s]"]
     for system, scores in result["table"].items():
         cells = "".join(
             f"{scores['unif'][column]:.3f} / {scores['near'][column]:.3f}".rjust(18)
@@ -166,7 +186,7 @@ def format_set(name: str, result: dict[str, Any]) -> str:
         )
         seconds = result["runs"].get(system, {}).get("seconds")
         took = f"{statistics.median(seconds):12.2f}" if seconds else ""
-        lines.append(system.ljust(24) + cells + took)
+        lines.append(system.ljust(28) + cells + took)
     spread = max(
         (
             value
@@ -230,6 +250,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--systems", nargs="+", default=["map", "octomap"])
     parser.add_argument("--tune", action="store_true", help="also measure fine-tuned maps")
+    parser.add_argument(
+        "--hit-noise", action="store_true", help="also measure maps with --hit-noise auto"
+    )
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "accuracy.json")
     return parser.parse_args()
 
@@ -239,7 +262,7 @@ def main() -> None:
     arguments = parse_arguments()
     names = [*arguments.systems, *(["tuned"] if arguments.tune else [])]
     resolutions = WHOLE_SCAN_RESOLUTIONS if arguments.whole_scans else RESOLUTIONS
-    systems = choose_systems(names, resolutions)
+    systems = choose_systems(names, resolutions, arguments.hit_noise)
     sets = find_sets(arguments.data, arguments.sets)
     if not sets or not systems:
         sys.exit(f"nothing to measure: sets {list(sets)} in {arguments.data}, systems {names}")

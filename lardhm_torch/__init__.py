@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # for editors and type checkers; tests hold it equal to the t
     from lardhm_torch.io.scan_files import load_points as load_points
     from lardhm_torch.io.scan_files import load_scans as load_scans
     from lardhm_torch.io.scan_files import save_scans as save_scans
+    from lardhm_torch.learning.disagreement import scan_disagreement as scan_disagreement
     from lardhm_torch.learning.fine_tuning import TuneConfig as TuneConfig
     from lardhm_torch.learning.fine_tuning import fine_tune as fine_tune
     from lardhm_torch.learning.fitting import FitConfig as FitConfig
@@ -73,6 +74,7 @@ _NAMES = {
     "io.notes": ["ScanReport"],
     "io.onnx_files": ["save_onnx"],
     "io.scan_files": ["iter_scans", "load_points", "load_scans", "save_scans"],
+    "learning.disagreement": ["scan_disagreement"],
     "learning.fine_tuning": ["TuneConfig", "fine_tune"],
     "learning.fitting": ["FitConfig"],
     "learning.map_merging": ["merge_maps"],

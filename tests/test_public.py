@@ -41,9 +41,9 @@ def test_the_fixed_names_are_public():
         StreamConfig TiledMap TuneConfig UpdateConfig body_collision_probability body_distance
         capsule_distance channel clearance collision_probability evaluate expected_range extract_mesh
         fine_tune free_probability frontiers grid information_gain iter_scans load_points load_scans
-        merge_maps query_grid query_slice raycast real_time resize_optimizer resume_stream
-        sample_rays save_grid save_mesh save_nav2 save_onnx save_scans segment_hazard signed_distance
-        simplify_mesh simulate_room split_rays stream_scans surface_distance
+        merge_maps query_grid query_slice raycast real_time resize_optimizer resume_stream sample_rays
+        save_grid save_mesh save_nav2 save_onnx save_scans scan_disagreement segment_hazard
+        signed_distance simplify_mesh simulate_room split_rays stream_scans surface_distance
     """
     assert fixed.split() == NAMES
 

@@ -77,7 +77,7 @@ def fit(arguments: argparse.Namespace) -> None:
 
 
 def _fit_at_once(arguments: argparse.Namespace) -> None:
-    from lardhm_torch import sample_rays
+    from lardhm_torch import sample_rays, scan_disagreement
 
     if arguments.resume or arguments.view:
         raise ValueError("--resume and --view need --incremental")
@@ -95,6 +95,8 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
     report_dropped(samples.dropped)
     if not bool((samples.labels == 1).any()):
         raise ValueError(f"scans must hold at least one hit within range; got {samples.dropped}")
+    apart = scan_disagreement(scans)
+    noise = apart if arguments.hit_noise is None else arguments.hit_noise
     model = _new_map(scans.dim, arguments)
     model.fit(
         samples.points,
@@ -102,17 +104,18 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
         channels=samples.channels,
         progress=True,
-        **fit_settings(arguments),
+        **fit_settings(arguments, noise),
     )
     if arguments.tune or arguments.tune_state:
-        _tune(model, scans, samples, state, arguments)
+        _tune(model, scans, samples, state, noise, arguments)
     if arguments.uncertainty:
         model.fit_uncertainty(samples.points, samples.labels)
     model.save(arguments.output)
     hits, free = (int((samples.labels == label).sum()) for label in (1, 0))
+    disagree = f"; scans disagree by {100 * apart:.1f} cm" if apart else ""
     print(
         f"{hits} hits and {free} free points -> {len(model)} clusters -> {arguments.output}"
-        f"{far_hits(arguments)}"
+        f"{far_hits(arguments)}{disagree}"
     )
 
 
@@ -140,10 +143,11 @@ def _tune(
     scans: Scans,
     samples: Samples,
     state: dict[str, Any] | None,
+    hit_noise: float,
     arguments: argparse.Namespace,
 ) -> None:
     """Fine-tune with free points sampled again in every epoch."""
-    from lardhm_torch import fine_tune, sample_rays
+    from lardhm_torch import TuneConfig, fine_tune, sample_rays
     from lardhm_torch.io.map_files import save_state
 
     path, sampling = arguments.tune_state, sampling_of(arguments)
@@ -156,6 +160,7 @@ def _tune(
         state=state,
         after_epoch=(lambda state: save_state(state, path)) if path else None,
         progress=True,
+        config=TuneConfig(hit_noise=hit_noise),
     )
 
 

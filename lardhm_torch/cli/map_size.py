@@ -1,9 +1,11 @@
-"""Arguments of the command line for the number of clusters of a map."""
+"""Arguments of the command line that become settings of `LardHilbertMap.fit`."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
+from dataclasses import replace
 from typing import Any
 
 UNITS = {"": 1, "B": 1, "kB": 1000, "MB": 1000**2, "KiB": 1024, "MiB": 1024**2}
@@ -31,6 +33,33 @@ def add_map_size(sub: argparse.ArgumentParser) -> None:
     )
 
 
+def add_hit_noise(sub: argparse.ArgumentParser) -> None:
+    """Add ``--hit-noise``."""
+    sub.add_argument(
+        "--hit-noise",
+        type=length_or_auto,
+        default=0.0,
+        metavar="METERS",
+        help="make surfaces thicker by this standard deviation, for queries at the poses of other scans "
+        "than SCANS; auto: what SCANS disagree by, estimated where they overlap (default: 0)",
+    )
+
+
+def length_or_auto(text: str) -> float | None:
+    """Meters, or None for ``auto``."""
+    if text == "auto":
+        return None
+    try:
+        length = float(text)
+    except ValueError:
+        length = math.nan
+    if not 0 <= length < math.inf:
+        raise argparse.ArgumentTypeError(
+            f"a length must be 0 or more meters, or auto; got {text!r}"
+        )
+    return length
+
+
 def size_in_bytes(text: str) -> int:
     """Bytes of a size such as ``20kB``, ``1.5MB`` or ``20000``."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([A-Za-z]*)", text)
@@ -41,12 +70,17 @@ def size_in_bytes(text: str) -> int:
     return int(float(found[1]) * UNITS[found[2]])
 
 
-def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+def fit_settings(arguments: argparse.Namespace, hit_noise: float) -> dict[str, Any]:
     """Keyword arguments of `LardHilbertMap.fit`.
+
+    Args:
+        arguments: of the command line.
+        hit_noise: standard deviation of the hits [m].
 
     Raises:
         ValueError: arguments exclude each other.
     """
+    from lardhm_torch.learning.fitting import FitConfig
     from lardhm_torch.learning.sized_maps import SMALL
 
     is_tuned = bool(arguments.tune or arguments.tune_state)
@@ -54,13 +88,17 @@ def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ValueError("--size and --small cannot be used with --tune, which also trains shapes")
     if arguments.small and arguments.clusters is not None:
         raise ValueError("--small cannot be used with --clusters; it chooses the number")
-    settings: dict[str, Any] = {"num_clusters": arguments.clusters, "max_bytes": arguments.size}
-    if arguments.small:
-        settings["config"] = SMALL
-    return settings
+    config = SMALL if arguments.small or arguments.size is not None else FitConfig()
+    return {
+        "num_clusters": arguments.clusters,
+        "max_bytes": arguments.size,
+        "config": replace(config, hit_noise=hit_noise),
+    }
 
 
 def check_not_incremental(arguments: argparse.Namespace) -> None:
     """Raise a ValueError for arguments that an incremental fit does not support."""
     if arguments.size is not None or arguments.small:
         raise ValueError("--size and --small cannot be used with --incremental")
+    if arguments.hit_noise != 0:
+        raise ValueError("--hit-noise needs all scans at once; omit --incremental")

@@ -7,7 +7,7 @@ from typing import Any
 
 from lardhm_torch.cli import learning, queries, tiling
 from lardhm_torch.cli.forgetting import add_forgetting
-from lardhm_torch.cli.map_size import add_map_size
+from lardhm_torch.cli.map_size import add_hit_noise, add_map_size
 from lardhm_torch.cli.scan_arguments import add_ranges, add_reading, add_scans, finite
 
 MAP = "map file, or folder of a tiled map"
@@ -84,6 +84,7 @@ def _fit(sub: argparse.ArgumentParser) -> None:
     add_scans(sub)
     _output(sub, "map to write: .pt, .pth or .safetensors")
     add_map_size(sub)
+    add_hit_noise(sub)
     _neighbors(sub)
     sub.add_argument(
         "--tune",

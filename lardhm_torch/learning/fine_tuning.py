@@ -19,7 +19,13 @@ from lardhm_torch.learning.fitting import (
     stratified_batches,
 )
 from lardhm_torch.learning.parameters import MapParameters, read_state
-from lardhm_torch.learning.points import check_samples, in_morton_order, to_map_frame
+from lardhm_torch.learning.points import (
+    blurred_hits,
+    check_noise,
+    check_samples,
+    in_morton_order,
+    to_map_frame,
+)
 from lardhm_torch.learning.tuning_steps import (
     Batches,
     Moving,
@@ -96,6 +102,8 @@ def fine_tune(
     rng = seeded_generator(seed, "fine_tune", model.origin.device)
     held_rays = _hold_out(samples, config.hold_out, rng)
     train, evaluation = _divide(samples, held_rays)
+    seen = blurred_hits(evaluation.positions, evaluation.labels, config.hit_noise, rng)
+    evaluation = evaluation._replace(positions=seen)
     run = TuningRun(model, config, rng, evaluation)
     run.load(state) if state else run.losses.append(run.evaluate())
     for epoch in run.epochs(progress):
@@ -191,6 +199,7 @@ class TuneConfig:
     l2: float = 0.25  # penalty on squared weights
     stiffness: float = 0.8  # penalty on squared offsets of centers and length scales
     occupied_share: float = 0.6  # class weight of occupied points, see `fitting.FitConfig`
+    hit_noise: float = 0.0  # [m] random displacement of hits in training, see `FitConfig`
     unknown_share: float = 0.1  # relative loss of unknown points, see `FitConfig`; 0: omit them
     hold_out: float = 0.0  # fraction of rays used to select the best epoch; 0: keep the last
     patience: int | None = None  # stop after this many epochs without improvement
@@ -210,6 +219,7 @@ class TuneConfig:
             raise ValueError(
                 f"l2 and stiffness must be 0 or more; got {self.l2} and {self.stiffness}"
             )
+        check_noise(self.hit_noise)
         if not 0 < self.occupied_share < 1:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
         if not self.unknown_share >= 0:
@@ -305,6 +315,7 @@ class TuningRun:
         for group, steps_per_pass in enumerate(steps):
             columns = (positions, targets, factors)
             points, labels, weights = (column[group::groups].contiguous() for column in columns)
+            points = blurred_hits(points, labels, config.hit_noise, self.rng)
             near = self._neighbors(points)
             *batches, near = stratified_batches(
                 (points, labels, weights, near), batch_size, self.rng

@@ -15,6 +15,7 @@ from lardhm_torch.features import Kernel
 from lardhm_torch.learning.clustering import cluster_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
+from lardhm_torch.learning.points import blurred_hits, check_noise
 from lardhm_torch.learning.unseen import settle_unknown
 
 CHUNK_ROWS = 1 << 21  # number of points whose features are computed at a time
@@ -45,6 +46,9 @@ class FitConfig:
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
     occupied_share: float = 0.6
     unknown_share: float = 0.25  # weight of the loss of unknown points, relative to all others
+    # [m] standard deviation of random displacements of hits while the weights are trained. Surfaces are
+    # then as thick as scans disagree (`scan_disagreement`), for queries at the poses of other scans.
+    hit_noise: float = 0.0
     # passes that also train centers and length scales of a small map: the number of clusters is chosen
     # by the held-out loss of a coarse map (`scene_clusters`), about a third of the default.
     # Probabilities are as accurate, but ranges and meshes are less exact. 4 is recommended; 0: off.
@@ -73,6 +77,7 @@ class FitConfig:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
         if not self.unknown_share >= 0:
             raise ValueError(f"unknown_share must be 0 or more; got {self.unknown_share}")
+        check_noise(self.hit_noise)
         if self.l1 < 0 or self.l2 < 0:
             raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
@@ -116,9 +121,10 @@ def fit_clusters(
     clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
     state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
     state = replace(state, evidence=fitted_evidence(points, labels, state, task.rng))
-    columns = settle_unknown(points, labels, state, task.kernel, task.rng)
-    batch_size = task.config.rows_per_batch(len(columns[0]))
-    points, labels = stratified_batches(columns, batch_size, task.rng)
+    points, labels = settle_unknown(points, labels, state, task.kernel, task.rng)
+    points = blurred_hits(points, labels, task.config.hit_noise, task.rng)
+    batch_size = task.config.rows_per_batch(len(points))
+    points, labels = stratified_batches((points, labels), batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def compute(rows: slice) -> tuple[Tensor, Tensor]:

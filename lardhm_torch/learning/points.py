@@ -173,6 +173,31 @@ def in_morton_order(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
     return tuple(column.index_select(0, order) for column in (points, *columns))
 
 
+def blurred_hits(points: Tensor, labels: Tensor, noise: float, rng: torch.Generator) -> Tensor:
+    """(N, D) positions of which the occupied ones are moved at random, so that surfaces get thicker.
+
+    Weights that are trained there make the map as unsure of a surface as the scans disagree.
+
+    Args:
+        points: (N, D) positions [m].
+        labels: (N,) 1 occupied, others free or unknown.
+        noise: standard deviation along each axis [m]; 0: the points are returned as they are.
+        rng: random generator, not used without noise.
+    """
+    if noise == 0:
+        return points
+    rows = (labels > UNKNOWN).nonzero().squeeze(1)
+    shape = (len(rows), points.shape[1])
+    moves = noise * torch.randn(shape, generator=rng, device=rng.device, dtype=torch.float64)
+    return points.index_add(0, rows, moves.to(points))
+
+
+def check_noise(noise: float) -> None:
+    """Raise a ValueError if the standard deviation of hits is not a length."""
+    if not 0 <= noise < float("inf"):
+        raise ValueError(f"hit_noise must be 0 or more, in meters; got {noise}")
+
+
 def morton_order(points: Tensor) -> Tensor:
     """(N, D) positions -> (N,) int64 indices that sort them by their Morton codes."""
     if native.supports(points):

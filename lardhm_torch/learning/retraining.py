@@ -20,7 +20,7 @@ from lardhm_torch.learning.fitting import (
 )
 from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState
-from lardhm_torch.learning.points import morton_order
+from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
@@ -99,6 +99,7 @@ def trained(
     """
     points, labels, factors = samples
     config = task.config
+    points = blurred_hits(points, labels, config.hit_noise, task.rng)
     batch_size = config.rows_per_batch(len(points))
     along = torch.arange(len(points), device=points.device)
     (batched,) = stratified_batches((along,), batch_size, task.rng)

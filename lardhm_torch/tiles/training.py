@@ -31,7 +31,7 @@ from lardhm_torch.learning.clustering import (
 )
 from lardhm_torch.learning.fitting import FitConfig, class_factors, fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
-from lardhm_torch.learning.points import in_morton_order
+from lardhm_torch.learning.points import blurred_hits, in_morton_order
 from lardhm_torch.tiles.indexing import Index
 from lardhm_torch.tiles.ledger import Counts
 from lardhm_torch.tiles.records import OCCUPIED, TilePoints
@@ -134,6 +134,7 @@ def train_tile(
     config = replace(task.config, batch_size=task.config.batch_size or rows)
     size = config.rows_per_batch(len(tile.points))
     points, kind = in_morton_order(*tile)
+    points = blurred_hits(points, (kind & OCCUPIED).to(points), config.hit_noise, task.rng)
     order = torch.arange(len(kind), device=kind.device)
     order, kind = stratified_batches((order, kind), size, task.rng)
     index = native.build_index(clusters.means, task.kernel.num_neighbors)
