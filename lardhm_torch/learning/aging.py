@@ -49,8 +49,9 @@ def timed(
     for kind, label in enumerate((1.0, 0.0, 0.5)):
         own = points[labels == label]
         if len(own):
-            sums = feature_sums(own, part.centers, part.raw_scale_tril, kernel, index)
-            seen |= (sums > SEEN) & (part.kinds == kind)
+            wanted = part.kinds == kind
+            sums = feature_sums(own, part.centers, part.raw_scale_tril, wanted, kernel, index)
+            seen |= sums > SEEN
     latest = part.times.clamp(min=time)  # scans may come in any order
     return replace(part, times=torch.where(seen, latest, part.times))
 

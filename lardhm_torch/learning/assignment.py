@@ -57,23 +57,29 @@ def nearest_clusters(points: Tensor, clusters: Clusters, floor: float, radius: f
 
 
 def feature_sums(
-    points: Tensor, centers: Tensor, raw_scale_tril: Tensor, kernel: Kernel, index: Tensor
+    points: Tensor,
+    centers: Tensor,
+    raw_scale_tril: Tensor,
+    wanted: Tensor,
+    kernel: Kernel,
+    index: Tensor,
 ) -> Tensor:
-    """(M,) sum of the features of each cluster over points.
+    """(M,) sum of the features of each wanted cluster over points, 0 for others.
 
     Args:
         points: (N, D) positions [m].
         centers: (M, D) cluster centers [m].
         raw_scale_tril: (M, D, D) factors with log-transformed diagonals.
+        wanted: (M,) bool.
         kernel: k, covariance scale and minimum length scale.
         index: search index of the centers, see `native.build_index`.
     """
     if native.supports(points):
         given = (points, centers, raw_scale_tril, index)
-        return torch.ops.lardhm.feature_sums(*(t.detach() for t in given), *kernel)
+        return torch.ops.lardhm.feature_sums(*(t.detach() for t in given), wanted, *kernel)
     found, values = native.nearest_features(points, centers, raw_scale_tril, kernel, index)
     sums = torch.zeros_like(centers[:, 0])
-    return sums.index_add_(0, found.reshape(-1).long(), values.reshape(-1))
+    return sums.index_add_(0, found.reshape(-1).long(), values.reshape(-1)) * wanted
 
 
 def ordered_features(

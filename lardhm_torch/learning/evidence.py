@@ -22,22 +22,10 @@ from lardhm_torch.learning.clustering import (
     split_labels,
 )
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
+from lardhm_torch.native.thinning import BITS, priorities
 from lardhm_torch.sampling import spread_rows
 
 SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
-MULTIPLIERS = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)  # of the hash: xxHash's primes
-BITS = 31  # of a priority
-
-
-def priorities(points: Tensor) -> Tensor:
-    """(N, D) positions -> (N,) int64 hashes of the coordinates in float32, below 2^31."""
-    words = points.float().view(torch.int32).long() & 0xFFFFFFFF
-    mixed = torch.zeros_like(words[:, 0])
-    for axis in range(points.shape[1]):
-        mixed = (mixed ^ words[:, axis]) * MULTIPLIERS[axis % 3] & 0xFFFFFFFF
-        mixed = mixed ^ (mixed >> 15)
-    mixed = mixed * MULTIPLIERS[1] & 0xFFFFFFFF
-    return mixed >> (32 - BITS)
 
 
 def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
@@ -71,6 +59,34 @@ def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
     return evidence
 
 
+def add_points(
+    evidence: Tensor, cleared: Tensor, points: Tensor, owners: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Evidence after more points were added, see `keep_points`.
+
+    Args:
+        evidence: (K, E, D) of the first clusters; later ones keep no points yet.
+        cleared: (M,) bool, clusters that lose the points that they keep first.
+        points: (N, D) positions [m].
+        owners: (N,) cluster of each point; points with any other number are left out.
+
+    Returns:
+        (M, E, D) evidence, and (M,) number of points that a cluster keeps and did not keep before.
+    """
+    if native.supports(points):
+        return torch.ops.lardhm.add_points(evidence, cleared, points, owners.int())
+    count = len(cleared)
+    before = evidence.new_full((count, *evidence.shape[1:]), torch.inf)
+    before[: len(evidence)] = evidence
+    kept, homes = kept_points(before, (~cleared).nonzero().squeeze(1))
+    after = keep_points(torch.cat([kept, points]), torch.cat([homes, owners.to(homes)]), count)
+    inside = owners[(owners >= 0) & (owners < count)].long()
+    touched = cleared.index_fill(0, inside, True)
+    after = after.where(touched[:, None, None], before)
+    again = (after[:, :, None] == before[:, None]).all(dim=3).any(dim=2)
+    return after, (~again & ~after[:, :, 0].isinf()).sum(dim=1)
+
+
 def kept_counts(evidence: Tensor) -> Tensor:
     """(M, E, D) evidence -> (M,) number of kept points."""
     if _is_native(evidence):
@@ -102,11 +118,13 @@ def kept_again(points: Tensor, owners: Tensor, evidence: Tensor) -> Tensor:
 
     Args:
         points: (N, D) positions [m].
-        owners: (N,) their clusters.
+        owners: (N,) their clusters; points with any other number are left out.
         evidence: (M, E, D).
     """
     if _is_native(evidence):
         return torch.ops.lardhm.kept_again(points, owners, evidence)
+    inside = (owners >= 0) & (owners < len(evidence))
+    points, owners = points[inside], owners[inside]
     again = (evidence[owners] == points[:, None]).all(dim=2).any(dim=1)
     return torch.bincount(owners[again], minlength=len(evidence))
 
@@ -182,9 +200,15 @@ def follow_kept(
 
 
 def halves(evidence: Tensor) -> tuple[Tensor, Tensor]:
-    """Evidence of the two halves of each cluster, divided at the mean along its longest axis."""
+    """Evidence of the two halves of each cluster, divided at the mean along its longest axis.
+
+    The first half is where the largest component of the axis is positive.
+    """
+    if _is_native(evidence):
+        return torch.ops.lardhm.halves(evidence)
     clusters = evidence_moments(evidence)
     axes = torch.linalg.eigh(clusters.covariances).eigenvectors[:, :, -1]
+    axes = axes * axes.gather(1, axes.abs().argmax(dim=1, keepdim=True)).sign()
     along = ((evidence - clusters.means[:, None]) * axes[:, None]).sum(dim=2)
     parts = []
     for inside in (along > 0, along <= 0):  # padding is in neither

@@ -207,11 +207,19 @@ def label_factors(
     The first and last are those of `class_factors`. The total weight of the unknown points is
     ``unknown_share`` times that of all others.
     """
-    occupied = (labels > 0.5).sum().double()
-    unknown = (labels == 0.5).sum().double()
-    known = len(labels) - unknown
-    free, hit = class_factors(known - occupied, occupied, occupied_share).unbind()
-    return torch.stack([free, unknown_share * known / unknown.clamp(min=1), hit])
+    occupied, unknown = (labels > 0.5).sum(), (labels == 0.5).sum()
+    counts = torch.stack([len(labels) - unknown - occupied, unknown, occupied])
+    return count_factors(counts, occupied_share, unknown_share)
+
+
+def count_factors(
+    counts: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
+) -> Tensor:
+    """(3,) numbers of free, unknown and occupied points -> their `label_factors`."""
+    free, unknown, occupied = counts.double().unbind()
+    known = free + occupied
+    factor, hit = class_factors(free, occupied, occupied_share).unbind()
+    return torch.stack([factor, unknown_share * known / unknown.clamp(min=1), hit])
 
 
 def balance_classes(

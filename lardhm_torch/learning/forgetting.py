@@ -15,7 +15,8 @@ from torch import Tensor
 
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import feature_sums
-from lardhm_torch.learning.evidence import first_points, kept_counts
+from lardhm_torch.learning.clustering import split_labels
+from lardhm_torch.learning.evidence import kept_counts
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.sampling import UNKNOWN
 
@@ -40,14 +41,13 @@ def doubted(
         kernel: kernel settings of the map.
         index: search index of the centers, see `native.build_index`.
     """
-    seen = labels != UNKNOWN
-    points, is_hit = points[seen], labels[seen] > UNKNOWN
-    if len(known) == 0 or len(points) == 0:
+    if len(known) == 0 or not bool((labels != UNKNOWN).any()):
         return known.doubts
     kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, NARROWEST))
-    parameters = (known.centers, known.raw_scale_tril, kernel, index)
-    hits, passed = (feature_sums(points[rows], *parameters) for rows in (is_hit, ~is_hit))
-    doubts = torch.where(hits > HIT, 0, known.doubts + passed)
+    parameters = (known.centers, known.raw_scale_tril, known.is_occupied, kernel, index)
+    hits, free, _ = split_labels(points, labels)
+    hit, passed = (feature_sums(part, *parameters) for part in (hits, free))
+    doubts = torch.where(hit > HIT, 0, known.doubts + passed)
     return doubts * known.is_occupied
 
 
@@ -69,9 +69,12 @@ def forget(known: MapState, before: Tensor) -> MapState:
     kept = kept_counts(known.evidence)
     lost = (known.doubts > GONE) | ((known.kinds == 2) & (known.losses > OVERRULED))
     changed = trust(known.doubts) != trust(before)
+    evidence = known.evidence
+    if bool(lost.any()):
+        evidence = evidence.index_fill(0, lost.nonzero().squeeze(1), torch.inf)
     return replace(
         known,
-        evidence=first_points(known.evidence, torch.where(lost, 0, kept)),
+        evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
         fresh=torch.where(changed | lost, kept.to(known.fresh), known.fresh),
     )

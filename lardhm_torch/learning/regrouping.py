@@ -24,10 +24,10 @@ from lardhm_torch.learning.clustering import (
     most_clusters,
 )
 from lardhm_torch.learning.evidence import (
+    add_points,
     evidence_moments,
     following,
     halves,
-    keep_points,
     kept_again,
     kept_counts,
     kept_points,
@@ -38,6 +38,9 @@ from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
+MANY = (
+    0.25  # new points relative to the kept ones, above which the points of a cluster are regrouped
+)
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 
@@ -65,7 +68,7 @@ class Groups(NamedTuple):
 
     Args:
         state: M clusters without evidence.
-        evidence: (M, E, D) their points.
+        evidence: (K, E, D) the points of the first ones; new clusters, the last ones, have none yet.
         kinds: (M,) class, see `MapState.kinds`.
         changed: (M,) bool: the points go to the nearest centers.
     """
@@ -74,6 +77,11 @@ class Groups(NamedTuple):
     evidence: Tensor
     kinds: Tensor
     changed: Tensor
+
+    @property
+    def sizes(self) -> Tensor:
+        """(M,) number of points of each cluster."""
+        return _padded(kept_counts(self.evidence), len(self.kinds))
 
     def rows(self, kind: int) -> Tensor:
         """Rows of the clusters of a class."""
@@ -101,11 +109,17 @@ def regrouped(
     points, joined = points[joined >= 0], joined[joined >= 0]
     received = torch.bincount(joined, minlength=len(groups.kinds))
     alive = _kept(groups, received, before, rule)
-    groups = groups._replace(changed=groups.changed | (received > 0) | ~alive)
+    many = received > MANY * groups.sizes
+    groups = groups._replace(changed=groups.changed | many | ~alive)
     counts = groups.state.counts + _unseen(groups, points, joined, received)
     state = replace(groups.state, counts=torch.where(groups.kinds < 2, counts, 0))
     state = replace(state, scatters=_rescaled(groups.state, state.counts))
     return _reassigned(groups._replace(state=state), points, joined, alive, len(known), rule.floor)
+
+
+def _padded(counts: Tensor, size: int) -> Tensor:
+    """Counts of the first clusters, followed by zeros for others: (size,)."""
+    return torch.nn.functional.pad(counts, (0, size - len(counts)))
 
 
 def _divide(known: MapState, rule: Rule) -> Groups:
@@ -125,8 +139,8 @@ def _divide(known: MapState, rule: Rule) -> Groups:
         rows.append(found)
     chosen = torch.cat(rows)
     if len(chosen) == 0:
-        return Groups(light, known.evidence.clone(), kinds, divided)
-    first, second = halves(known.evidence[chosen])
+        return Groups(light, known.evidence, kinds, divided)
+    first, second = halves(known.evidence.index_select(0, chosen))
     sizes = torch.stack([kept_counts(first), kept_counts(second)])
     balanced = (sizes.amin(dim=0) >= MIN_COUNT).nonzero().squeeze(1)
     chosen, first, second = chosen[balanced], first[balanced], second[balanced]
@@ -204,10 +218,9 @@ def _joined(
     for new in added:
         state = state.put(joined[:0], new)
     count = start - len(groups.kinds)
-    empty = groups.evidence.new_full((count, *groups.evidence.shape[1:]), torch.inf)
     return Groups(
         state,
-        torch.cat([groups.evidence, empty]),
+        groups.evidence,
         torch.cat([groups.kinds, *kinds]),
         torch.cat([groups.changed, groups.changed.new_ones(count)]),
     ), owners
@@ -236,7 +249,7 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
         before: number of clusters before new ones were added.
         rule: limits.
     """
-    sizes = kept_counts(groups.evidence) + received
+    sizes = groups.sizes + received
     alive = sizes >= (1 if rule.few else MIN_COUNT)
     occupied = rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
@@ -261,35 +274,29 @@ def _unseen(groups: Groups, points: Tensor, owners: Tensor, joined: Tensor) -> T
 
     A cluster that keeps one in r of its points recognizes one in r of those that it receives again.
     """
-    found = kept_again(points, owners, groups.evidence)
-    kept = kept_counts(groups.evidence).clamp(min=1)
-    represented = (groups.state.counts / kept).clamp(min=1)
+    found = _padded(kept_again(points, owners, groups.evidence), len(joined))
+    represented = (groups.state.counts / groups.sizes.clamp(min=1)).clamp(min=1)
     return joined - torch.minimum(joined, (found * represented).round().to(joined))
 
 
 def _reassigned(
     groups: Groups, points: Tensor, owners: Tensor, alive: Tensor, num_known: int, floor: float
 ) -> MapState:
-    """Clusters after all points of changed ones and new points went to the nearest center."""
+    """Clusters after new points and all points of changed clusters went to the nearest centers."""
     state, evidence, changed = groups.state, groups.evidence, groups.changed
-    moving, homes = kept_points(evidence, changed.nonzero().squeeze(1))
+    moving, homes = kept_points(evidence, changed[: len(evidence)].nonzero().squeeze(1))
     moving, homes = torch.cat([points, moving]), torch.cat([owners, homes])
     target = torch.full_like(homes, -1)
+    kinds = groups.kinds[homes]
     for kind in range(3):
         rows = (alive & (groups.kinds == kind)).nonzero().squeeze(1)
-        own = (groups.kinds[homes] == kind).nonzero().squeeze(1)
+        own = (kinds == kind).nonzero().squeeze(1)
         if len(rows) and len(own):
             target[own] = rows[_nearest(moving[own], state.means[rows])]
-    receives = torch.zeros_like(alive).index_fill_(0, target[target >= 0], True)
-    staying, places = kept_points(evidence, (receives & ~changed).nonzero().squeeze(1))
-    order = torch.cumsum(receives, 0) - 1  # of the clusters that receive points
-    homes = torch.cat([torch.where(target >= 0, order[target], -1), order[places]])
-    kept = keep_points(torch.cat([moving, staying]), homes, int(receives.sum()))
-    rows = receives.nonzero().squeeze(1)
-    new = (kept != evidence[rows]).any(dim=2).sum(dim=1)
-    evidence = evidence.index_fill_(0, (changed & ~receives).nonzero().squeeze(1), torch.inf)
-    evidence = evidence.index_copy_(0, rows, kept)
-    fresh = state.fresh.index_add(0, rows, new.to(state.fresh))
+    evidence, new = add_points(evidence, changed, moving, target)
+    sizes = kept_counts(evidence)
+    lost = (groups.sizes + new - sizes).clamp(min=0)
+    fresh = state.fresh + torch.maximum(new, lost).to(state.fresh)
     state = replace(state, evidence=evidence, fresh=fresh)
-    moved = (new > 0).nonzero().squeeze(1)
-    return following(state, rows[moved], kept[moved], num_known, floor)
+    moved = ((sizes > 0) & ((new > 0) | (lost > 0))).nonzero().squeeze(1)
+    return following(state, moved, evidence.index_select(0, moved), num_known, floor)

@@ -14,8 +14,8 @@ from lardhm_torch.learning.evidence import kept_counts, kept_points
 from lardhm_torch.learning.fitting import (
     FitConfig,
     FitTask,
+    count_factors,
     fit_weights,
-    label_factors,
     stratified_batches,
 )
 from lardhm_torch.learning.forgetting import trust
@@ -24,8 +24,8 @@ from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
-BLOCK = 128  # clusters that are chosen for training together
-MIN_BATCHES = 8  # per pass, so that few points give enough steps, too
+BLOCK = 256  # clusters that are chosen for training together
+MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
 
@@ -56,11 +56,10 @@ def retrained(
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
     points, owners = kept_points(state.evidence, rows)
-    kinds, strength = state.kinds[owners], evidence_weights(state)[owners]
-    factors = balanced(kinds, strength, config) * trust(state.doubts)[owners]
-    labels = KIND_LABELS.to(points)[kinds]
-    fewest = max(1, len(points) // MIN_BATCHES)
-    config = replace(config, batch_size=min(config.rows_per_batch(len(points)), fewest))
+    sizes = torch.bincount(owners, minlength=len(state))
+    factors = balanced(state.kinds, evidence_weights(state), config, sizes) * trust(state.doubts)
+    labels, factors = KIND_LABELS.to(points)[state.kinds][owners], factors[owners]
+    config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
     weights, (rows, losses) = trained(state, index, (points, labels, factors), task)
     owners = owners[rows]
@@ -72,6 +71,14 @@ def retrained(
         losses=torch.where(found > 0, losses, state.losses),
         fresh=state.fresh.masked_fill(moving, 0),
     )
+
+
+def _with_enough_steps(config: FitConfig, num_points: int) -> FitConfig:
+    """Training settings with smaller batches and more passes if there are few points."""
+    largest = max(1, num_points // MIN_BATCHES)
+    config = replace(config, batch_size=min(config.rows_per_batch(num_points), largest))
+    batches = -(-num_points // config.rows_per_batch(num_points))
+    return replace(config, passes=max(config.passes_over(num_points), -(-MIN_STEPS // batches)))
 
 
 def trained(
@@ -105,13 +112,24 @@ def trained(
         targets, state.weights, config, factors=factors[batched],
     )  # fmt: skip
     rows = slice(None, None, LOSS_STRIDE)
-    log_odds = (features[1][rows] * weights[features[0][rows]]).sum(dim=1)
-    targets, batched = targets[rows], batched[rows]
-    loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, targets, reduction="none")
-    return weights, (
-        batched,
-        loss + torch.xlogy(targets, targets) + torch.xlogy(1 - targets, 1 - targets),
-    )
+    losses = excess_losses(features[0][rows], features[1][rows], targets[rows], weights)
+    return weights, (batched[rows], losses)
+
+
+def excess_losses(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
+    """(N,) loss of each sample, in excess of that of a perfect prediction.
+
+    Args:
+        indices: (N, K) clusters.
+        values: (N, K) kernel values.
+        labels: (N,) in [0, 1].
+        weights: (M,).
+    """
+    if native.descends(indices, values):
+        return torch.ops.lardhm.excess_losses(indices, values, labels, weights)
+    log_odds = (values * weights[indices]).sum(dim=1)
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, labels, reduction="none")
+    return loss + torch.xlogy(labels, labels) + torch.xlogy(1 - labels, 1 - labels)
 
 
 def _stalest(state: MapState, limit: int) -> Tensor:
@@ -150,12 +168,23 @@ def evidence_weights(state: MapState) -> Tensor:
     return represented.clamp(min=1).sqrt().to(state.weights)
 
 
-def balanced(kinds: Tensor, strength: Tensor, config: FitConfig) -> Tensor:
-    """(N,) loss factors, mean 1: sample weights within a class, and classes balanced as in `fit`."""
-    labels = KIND_LABELS.to(strength)[kinds]
-    shares = label_factors(labels, config.occupied_share, config.unknown_share).to(strength)
-    shares = shares[[2, 0, 1]]  # from the order of the labels to that of the kinds
-    means = torch.zeros_like(shares).index_add_(0, kinds, strength)
-    means /= torch.bincount(kinds, minlength=3).clamp(min=1)
-    factors = strength * (shares / means)[kinds]
-    return factors / factors.mean()
+def balanced(
+    kinds: Tensor, strength: Tensor, config: FitConfig, sizes: Tensor | None = None
+) -> Tensor:
+    """(N,) loss factors, mean 1: sample weights within a class, and classes balanced as in `fit`.
+
+    Args:
+        kinds: (N,) class of each sample, or of the samples of each group.
+        strength: (N,) their weights.
+        config: class weights.
+        sizes: (N,) number of samples of each group; None: one sample each.
+    """
+    sizes = torch.ones_like(strength) if sizes is None else sizes.to(strength)
+    counts = strength.new_zeros(3, dtype=torch.float64).index_add_(0, kinds, sizes.double())
+    # from the order of the labels to that of the kinds
+    shares = count_factors(counts[[1, 2, 0]], config.occupied_share, config.unknown_share)[
+        [2, 0, 1]
+    ]
+    means = torch.zeros_like(counts).index_add_(0, kinds, (sizes * strength).double())
+    factors = strength * (shares * counts / means.clamp(min=1e-30)).to(strength)[kinds]
+    return factors * (sizes.sum() / (sizes * factors).sum())

@@ -32,12 +32,13 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
+from lardhm_torch.native.thinning import few_per_cell
 from lardhm_torch.sampling import UNKNOWN, spread_rows
 
 MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
 UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown
 BOX_STDS = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
-UPDATE_FIT = FitConfig(passes=4, batch_size=1024)
+UPDATE_FIT = FitConfig(passes=2, batch_size=1024)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +48,13 @@ class UpdateConfig:
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance between merged clusters in Algorithm 2
     split_loss: float = 0.01  # clusters whose points have a larger mean log-loss are divided
+    cell_edge: float = 0.1  # [m] in a cell of this edge, at most 4 new points of a class are used
     max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
-    max_trained: int = 8_000  # maximum number of changed clusters to train; the others follow later
+    max_trained: int = 5_000  # maximum number of changed clusters to train; the others follow later
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
-        for name in ("zeta", "split_loss", "max_points", "max_trained"):
+        for name in ("zeta", "split_loss", "cell_edge", "max_points", "max_trained"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0; got {getattr(self, name)}")
 
@@ -104,7 +106,7 @@ def updated(
         return Changes(nearby, _as_in_paper(part, points, labels, num_clusters, task), nearby[:0])
     index = native.build_index(part.centers, kernel.num_neighbors)
     few = int(state.counts[state.is_occupied].sum() + (labels > UNKNOWN).sum()) <= FEW_POINTS
-    points, labels = _thinned(points, labels, config.max_points, rng)
+    points, labels = _thinned(points, labels, config, rng)
     points, labels = _still_unknown(part, points, labels, kernel, index)
     before = part.doubts
     part = replace(part, doubts=doubted(part, points, labels, kernel, index))
@@ -134,12 +136,19 @@ def _without(nearby: Tensor, part: MapState, alive: Tensor) -> Changes:
 
 
 def _thinned(
-    points: Tensor, labels: Tensor, limit: int, rng: torch.Generator
+    points: Tensor, labels: Tensor, config: UpdateConfig, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """At most ``limit`` samples of each label: a stratified random subset of the others."""
-    rows = []
+    """A few samples of each label in each cell, and a stratified random subset of many.
+
+    The samples of a scan are dense near the sensor and on close surfaces; the map is as accurate without
+    most of those.
+    """
+    rows, limit = [], config.max_points
     for label in (1.0, 0.0, UNKNOWN):
         own = (labels == label).nonzero().squeeze(1)
+        own = own[
+            few_per_cell(points.index_select(0, own), torch.zeros_like(own), config.cell_edge)
+        ]
         rows.append(own[spread_rows(len(own), limit, rng)] if len(own) > limit else own)
     chosen = torch.cat(rows)
     return points.index_select(0, chosen), labels.index_select(0, chosen)

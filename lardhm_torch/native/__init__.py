@@ -332,10 +332,28 @@ def _register() -> None:
     def _(points: Tensor, owners: Tensor, num_clusters: int, size: int) -> Tensor:
         return points.new_empty(num_clusters, size, points.shape[1])
 
+    @library.register_fake("lardhm::few_per_cell")
+    def _(points: Tensor, groups: Tensor, edge: float, most: int) -> Tensor:
+        return groups.new_empty(library.get_ctx().new_dynamic_size())
+
+    @library.register_fake("lardhm::add_points")
+    def _(evidence: Tensor, cleared: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+        count = cleared.shape[0]
+        new = cleared.new_empty(count, dtype=torch.long)
+        return evidence.new_empty(count, *evidence.shape[1:]), new
+
     @library.register_fake("lardhm::descent")
     def _(indices: Tensor, values: Tensor, labels: Tensor, factors: Tensor, weights: Tensor,
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
         return tuple(torch.empty_like(weights) for _ in range(3))
+
+    @library.register_fake("lardhm::halves")
+    def _(evidence: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.empty_like(evidence), torch.empty_like(evidence)
+
+    @library.register_fake("lardhm::excess_losses")
+    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
+        return torch.empty_like(labels)
 
     @library.register_fake("lardhm::tuning_steps")
     def _(points: Tensor, indices: Tensor, labels: Tensor, factors: Tensor, start: Tensor,

@@ -35,6 +35,7 @@ UNITS = (
         "evidence",
         "kept",
         "cells",
+        "thinning",
         "passages",
         "marching",
         "ridge",

@@ -174,10 +174,37 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
   return state;
 }
 
+// Loss of each row in excess of that of a perfect prediction.
+Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
+                     const Tensor& given_labels, const Tensor& given_weights) {
+  const Tensor indices = tidy(given_indices), values = tidy(given_values);
+  const Tensor labels = tidy(given_labels), weights = tidy(given_weights);
+  check_descent(indices, values, labels, labels, {weights, weights, weights});
+  const int64_t n = values.size(0), k = values.size(1);
+  const Tensor losses = new_empty(values, {n});
+  const auto run = [&](auto type) {
+    using T = decltype(type);
+    const int32_t* index = in<int32_t>(indices);
+    const T* value = in<T>(values);
+    for (int64_t row = 0; row < n; ++row, index += k, value += k) {
+      T sum = 0;
+      for (int64_t j = 0; j < k; ++j) sum += value[j] * in<T>(weights)[index[j]];
+      const T label = in<T>(labels)[row], other = 1 - label;
+      T loss = std::max(sum, T(0)) - sum * label + std::log1p(std::exp(-std::abs(sum)));
+      if (label > 0 && other > 0) loss += label * std::log(label) + other * std::log(other);
+      out<T>(losses)[row] = loss;
+    }
+  };
+  values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});
+  return losses;
+}
+
 }  // namespace
 
 std::vector<Operator> descent_operators() {
   return {
+      {"excess_losses(Tensor indices, Tensor values, Tensor labels, Tensor weights) -> Tensor",
+       &boxed<excess_losses>},
       {"descent(Tensor indices, Tensor values, Tensor labels, Tensor factors, Tensor weights, "
        "Tensor mean, Tensor square, int num_points, int batch_size, int first_step, "
        "int total_steps, float learning_rate, bool decay, bool preconditioner, float l1, float l2) "

@@ -13,6 +13,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 #include <utility>
 #include <vector>
 
@@ -23,7 +24,10 @@
 namespace lardhm {
 
 constexpr int64_t kMostPoints = 1024;  // in a region
-constexpr double kRegionPoints = 3000, kGroupPoints = 256, kSparse = 25;
+constexpr double kNotZero = 1e-30;     // [m^2] farther than centers at the point itself
+template <class T>  // so that rounding leaves the k-th center nothing
+constexpr T kFully = 1 + 2 * std::numeric_limits<T>::epsilon();
+constexpr double kRegionPoints = 3000, kGroupPoints = 160, kSparse = 25;
 
 // How many sorted points share a list of blocks, a list of candidates, a register. The fewer points
 // there are a center, the more centers lie between neighbors: where they are very sparse, a point
@@ -41,10 +45,8 @@ struct Sharing {
   }
 };
 
-// Cells of the Z curve hold a cube of a lattice's points, two an edge: packets of lattices in any order
-// of axes are compact.
-template <int D>
-constexpr double kPointsPerCell = 1 << D;
+// Points are uneven: cells are so fine that where most of them lie, a packet is larger than a cell.
+constexpr double kCellsPerPoint = 8;
 
 // Working memory of one thread.
 template <class T, int D>
@@ -71,8 +73,8 @@ struct Scratch {
   void reserve_list(int64_t n) {
     if (n <= room) return;
     room = 2 * n;
-    list.resize(room + kWide);
-    distance.allocate(room);
+    list.resize(room + kBeyond);
+    distance.allocate(room + kBeyond);
     bits.resize(room + kWide);
     selected.rank.resize(room + kWide);
     selected.bits.resize(room + kWide);
@@ -121,7 +123,7 @@ struct Engine {
       const T high = std::min(box.high[d], T(index.header.high[d] + 0.5 * reach));
       edges[d] = std::max(double(high) - double(low[d]), 0.0);
     }
-    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) / kPointsPerCell<D>));
+    const ZCurve<D> curve(edges, std::max<double>(1, double(end - begin) * kCellsPerPoint));
     curve.sort(points + begin * D, low, end - begin, s.sorter);
     if (all_finite) return end - begin;
     int64_t kept = 0;
@@ -152,7 +154,7 @@ struct Engine {
   // Where the run of sorted points i .. stop should end: not across a border of the Z curve's cells
   // whose cell holds many more points, for the curve jumps there and the run's box would be large.
   static int64_t cut(const std::vector<uint64_t>& items, int64_t n, int64_t i, int64_t stop) {
-    const int64_t around = 2 * (stop - i);
+    const int64_t around = 8 * (stop - i);
     const auto key = [&items](int64_t at) { return uint32_t(items[at] >> 32); };
     while (key(i) != key(stop - 1)) {
       const int bit = 31 - __builtin_clz(key(i) ^ key(stop - 1));
@@ -284,14 +286,14 @@ struct Engine {
       packet.order = s.order.data() + (i - first);
       packet.lanes = int(end - i);
       for (int d = 0; d < D; ++d) packet.x[d] = coordinates(s.x[d], i - first, end - first);
-      search(packet, region_of(s, i - first, end - first), s);
+      search(packet, region_of(s, i - first, end - first), visitor.wants_bits(), s);
       visitor.packet(packet, s.selected);
     }
   }
 
   // Selects among the centers within a radius of the packet: a guess from the packet before. Where
   // the k-th distance turns out larger, that distance is the radius of the second attempt.
-  void search(Packet<T, D>& packet, const Region<D>& region, Scratch<T, D>& s) const {
+  void search(Packet<T, D>& packet, const Region<D>& region, bool bits, Scratch<T, D>& s) const {
     float radius = std::max(s.radius, smallest_radius);
     for (;;) {
       if (radius > s.near_radius) look_farther(1.3f * radius, s);
@@ -300,16 +302,36 @@ struct Engine {
         radius = 2 * radius;
         continue;
       }
+      std::fill_n(s.list.data() + n, kBeyond, int32_t(index.header.count));
       const I limit = kth(packet, positions, s.list.data(), n, k, s.distance.data);
       const float farthest = std::sqrt(float(-smallest_lane<T>(-(V)limit))) * 1.00001f;
       if (farthest <= radius) {
         s.radius = farthest * 1.15f;
         packet.farthest = (V)limit;
-        packet.fading = fades ? T(1) / (packet.farthest + std::numeric_limits<T>::min()) : V{};
+        packet.fading = fades ? kFully<T> / (packet.farthest + std::numeric_limits<T>::min()) : V{};
+        packet.all_fade = fades && !bits && std::isfinite(farthest) &&
+                          smallest_lane<T>(packet.farthest) > kNotZero;
+        if (packet.all_fade) return select_nearer(packet, n, s);
         return slack ? select_farther(packet, region, s) : select(packet, limit, n, s);
       }
       radius = farthest;
     }
+  }
+
+  // Fills s.selected with those of the n listed centers that are nearer than a lane's k-th, and
+  // packet.squared with their distances. The bits are left out.
+  static void select_nearer(Packet<T, D>& packet, int64_t n, Scratch<T, D>& s) {
+    const I limit = (I)packet.farthest;
+    const uint32_t all = bits_le<I>(I{}, I{});
+    int64_t size = 0;
+    for (int64_t i = 0; i < n; ++i) {
+      const I distance = s.distance.data[i];
+      s.selected.rank[size] = s.list[i];
+      s.distance.data[size] = distance;
+      size += bits_le<I>(limit, distance) != all;
+    }
+    s.selected.size = size;
+    packet.squared = (const V*)s.distance.data;
   }
 
   // Fills s.selected with the centers up to each lane's slack farther than its k-th.
@@ -327,12 +349,7 @@ struct Engine {
     const int64_t n = s.near.pick(region, float(most) * 1.00001f, s.list.data());
     for (int64_t i = 0; i < n; ++i) {
       const T* center = positions + int64_t(s.list[i]) * Layout<D>::position;
-      V squared = {};
-      for (int d = 0; d < D; ++d) {
-        const V offset = packet.x[d] - center[d];
-        squared += offset * offset;
-      }
-      s.distance.data[i] = (I)squared;
+      s.distance.data[i] = (I)squared_distance<T, D>(packet, center);
     }
     const uint32_t all = ~0u >> (32 - packet.lanes);
     for (int64_t i = 0; i < n; ++i)

@@ -2,30 +2,15 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <cstring>
+#include <iterator>
 #include <limits>
 #include <vector>
 
 #include "clusters.h"
+#include "priority.h"
 
 namespace lardhm {
 namespace {
-
-constexpr uint32_t kMultipliers[3] = {0x9E3779B1u, 0x85EBCA77u, 0xC2B2AE3Du};
-
-// Hash of the coordinates in float32, below 2^31.
-template <class T, int D>
-uint32_t priority(const T* point) {
-  uint32_t mixed = 0;
-  for (int d = 0; d < D; ++d) {
-    const float value = float(point[d]);
-    uint32_t word;
-    std::memcpy(&word, &value, sizeof(word));
-    mixed = (mixed ^ word) * kMultipliers[d % 3];
-    mixed ^= mixed >> 15;
-  }
-  return (mixed * kMultipliers[1]) >> 1;
-}
 
 // Rows of the points of each cluster: those of cluster m are rows[first[m]] to rows[first[m + 1]].
 struct Groups {
@@ -45,15 +30,15 @@ struct Groups {
 
 template <class T, int D>
 struct Candidate {
-  uint32_t priority;
+  uint32_t rank;
   T point[D];
 
   bool operator<(const Candidate& other) const {
-    if (priority != other.priority) return priority < other.priority;
+    if (rank != other.rank) return rank < other.rank;
     return std::lexicographical_compare(point, point + D, other.point, other.point + D);
   }
   bool operator==(const Candidate& other) const {
-    return priority == other.priority && std::equal(point, point + D, other.point);
+    return rank == other.rank && std::equal(point, point + D, other.point);
   }
 };
 
@@ -72,7 +57,7 @@ void keep(const T* points, const int32_t* rows, int64_t n, int64_t size,
   found.resize(n);
   for (int64_t i = 0; i < n; ++i) {
     const T* point = points + int64_t(rows[i]) * D;
-    found[i].priority = priority<T, D>(point);
+    found[i].rank = priority<T, D>(point);
     std::copy_n(point, D, found[i].point);
   }
   if (n > 4 * size) {  // repeated points are rare: the smallest 2 size hold enough distinct ones
@@ -111,12 +96,110 @@ Tensor keep_points(const Tensor& given_points, const Tensor& given_owners, int64
   return kept;
 }
 
+// Candidates for one cluster's evidence: those it keeps, in ascending order, and new ones.
+template <class T, int D>
+struct Merger {
+  int64_t size;
+  std::vector<Candidate<T, D>> before, kept, added, merged;
+
+  void read(const T* points) {
+    before.clear();
+    for (int64_t i = 0; i < size && points[i * D] != std::numeric_limits<T>::infinity(); ++i)
+      before.push_back(candidate(points + i * D));
+    if (!std::is_sorted(before.begin(), before.end()))  // points that were moved with their map
+      std::sort(before.begin(), before.end());
+  }
+
+  static Candidate<T, D> candidate(const T* point) {
+    Candidate<T, D> found;
+    found.rank = priority<T, D>(point);
+    std::copy_n(point, D, found.point);
+    return found;
+  }
+
+  // Number of candidates of the ascending `merged` that are kept and were not before.
+  int64_t count_new() const {
+    int64_t count = 0;
+    auto old = before.begin();
+    for (const auto& one : merged) {
+      while (old != before.end() && *old < one) ++old;
+      count += old == before.end() || !(*old == one);
+    }
+    return count;
+  }
+
+  // Writes the evidence after the rows were added, and returns the number of its new points.
+  int64_t merge(const T* points, const int32_t* rows, int64_t n, bool cleared, T* to) {
+    kept.clear(), added.clear(), merged.clear();
+    if (!cleared) kept = before;
+    const bool full = int64_t(kept.size()) == size;
+    for (int64_t i = 0; i < n; ++i) {
+      const auto one = candidate(points + int64_t(rows[i]) * D);
+      if (!full || one < kept.back()) added.push_back(one);
+    }
+    if (added.empty() && !cleared) {
+      write(kept, size, to);
+      return 0;
+    }
+    std::sort(added.begin(), added.end());
+    std::merge(kept.begin(), kept.end(), added.begin(), added.end(), std::back_inserter(merged));
+    merged.erase(std::unique(merged.begin(), merged.end()), merged.end());
+    if (int64_t(merged.size()) > size) merged.resize(size);
+    write(merged, size, to);
+    return count_new();
+  }
+};
+
+Tensors<2> add_points(const Tensor& given_evidence, const Tensor& given_cleared,
+                      const Tensor& given_points, const Tensor& given_owners) {
+  const Tensor evidence = tidy(given_evidence), cleared = tidy(given_cleared);
+  const Tensor points = tidy(given_points), owners = tidy(given_owners);
+  const int64_t known = evidence.size(0), size = evidence.size(1), dim = evidence.size(2);
+  const int64_t count = cleared.numel(), n = points.size(0);
+  check(points.dim() == 2 && points.size(1) == dim && owners.numel() == n &&
+            points.scalar_type() == evidence.scalar_type() &&
+            owners.scalar_type() == ScalarType::Int,
+        "points must be (N, D) like the evidence, owners (N,) int32");
+  check(cleared.scalar_type() == ScalarType::Bool && count >= known,
+        "cleared must be bool, one per cluster");
+  const Tensors<2> result{new_empty(evidence, {count, size, dim}),
+                          new_empty(evidence, {count}, ScalarType::Long)};
+  dispatch(points, [&](auto type, auto dimension) {
+    using T = decltype(type);
+    constexpr int D = dimension();
+    const Groups groups(in<int32_t>(owners), n, count);
+    constexpr int64_t kGrain = 64;
+    run_tasks((count + kGrain - 1) / kGrain, [&](int64_t task) {
+      Merger<T, D> merger{size, {}, {}, {}, {}};
+      for (int64_t m = task * kGrain; m < std::min(count, (task + 1) * kGrain); ++m) {
+        const int64_t added = groups.first[m + 1] - groups.first[m];
+        T* to = out<T>(result[0]) + m * size * D;
+        out<int64_t>(result[1])[m] = 0;
+        if (m < known && !added && !in<bool>(cleared)[m]) {
+          std::copy_n(in<T>(evidence) + m * size * D, size * D, to);
+          continue;
+        }
+        merger.before.clear();
+        if (m < known) merger.read(in<T>(evidence) + m * size * D);
+        out<int64_t>(result[1])[m] =
+            merger.merge(in<T>(points), groups.rows.data() + groups.first[m], added,
+                         in<bool>(cleared)[m], to);
+      }
+    });
+    return 0;
+  });
+  return result;
+}
+
 }  // namespace
 
 std::vector<Operator> evidence_operators() {
   return {
       {"keep_points(Tensor points, Tensor owners, int num_clusters, int size) -> Tensor",
        &boxed<keep_points>},
+      {"add_points(Tensor evidence, Tensor cleared, Tensor points, Tensor owners) -> (Tensor, "
+       "Tensor)",
+       &boxed<add_points>},
   };
 }
 

@@ -60,11 +60,9 @@ struct BackwardVisitor final : Visitor<T, D> {
       const T* center = positions + int64_t(selected.rank[j]) * L::position;
       const T* shape = shapes + int64_t(selected.rank[j]) * L::shape;
       V* z = terms + j * kTerms;
-      V squared = {};
-      for (int d = 0; d < D; ++d) squared += (packet.x[d] - center[d]) * (packet.x[d] - center[d]);
       whiten<T, D>(packet, center, shape, z);
       const V kernel = mask_of<T>(selected.bits[j]) ? kernel_of<T, D>(z) : V{};
-      z[D + 1] = squared * packet.fading;
+      z[D + 1] = squared_distance(packet, center) * packet.fading;
       z[D] = kernel * fade_of<T>(z[D + 1]);
       z[D + 2] = kernel * fade_slope<T>(z[D + 1]);
       sum += z[D] * shape[L::weight];

@@ -212,6 +212,70 @@ Tensors<4> follow_kept(
   return {centers, means, scatters, raw};
 }
 
+// Direction of the largest eigenvalue of a symmetric matrix, by Jacobi's method; its largest component
+// is positive.
+template <int D>
+void longest_axis(const double* matrix, double* axis) {
+  constexpr int kSweeps = 12;
+  double a[D][D], v[D][D] = {};
+  for (int i = 0; i < D; ++i) {
+    v[i][i] = 1;
+    for (int j = 0; j < D; ++j) a[i][j] = matrix[i * D + j];
+  }
+  for (int sweep = 0; sweep < kSweeps; ++sweep)
+    for (int p = 0; p < D; ++p)
+      for (int q = p + 1; q < D; ++q) {
+        if (a[p][q] == 0) continue;
+        const double half = (a[q][q] - a[p][p]) / (2 * a[p][q]);
+        const double t = std::copysign(1 / (std::abs(half) + std::sqrt(half * half + 1)), half);
+        const double c = 1 / std::sqrt(t * t + 1), s = t * c;
+        for (int i = 0; i < D; ++i) {
+          const double x = a[i][p], y = a[i][q];
+          a[i][p] = c * x - s * y, a[i][q] = s * x + c * y;
+        }
+        for (int i = 0; i < D; ++i) {
+          const double x = a[p][i], y = a[q][i];
+          a[p][i] = c * x - s * y, a[q][i] = s * x + c * y;
+          const double z = v[i][p], w = v[i][q];
+          v[i][p] = c * z - s * w, v[i][q] = s * z + c * w;
+        }
+      }
+  int longest = 0, largest = 0;
+  for (int i = 1; i < D; ++i)
+    if (a[i][i] > a[longest][longest]) longest = i;
+  for (int i = 1; i < D; ++i)
+    if (std::abs(v[i][longest]) > std::abs(v[largest][longest])) largest = i;
+  for (int i = 0; i < D; ++i) axis[i] = v[largest][longest] < 0 ? -v[i][longest] : v[i][longest];
+}
+
+// The kept points of each cluster, divided at their mean along the longest axis.
+Tensors<2> halves(const Tensor& given) {
+  const Tensor evidence = tidy(given);
+  const int64_t count = evidence.size(0), size = evidence.size(1);
+  const Tensors<2> result{new_empty(evidence, evidence.sizes()),
+                          new_empty(evidence, evidence.sizes())};
+  with_evidence(evidence, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    for_rows(count, [&](int64_t row) {
+      const T* points = in<T>(evidence) + row * size * D;
+      T* to[2] = {out<T>(result[0]) + row * size * D, out<T>(result[1]) + row * size * D};
+      T* end[2] = {to[0] + size * D, to[1] + size * D};
+      const KeptMoments<T, D> found(points, size);
+      double axis[D];
+      longest_axis<D>(found.scatter, axis);
+      for (int64_t i = 0; i < int64_t(found.count); ++i, points += D) {
+        double along = 0;
+        for (int d = 0; d < D; ++d) along += (double(points[d]) - found.mean[d]) * axis[d];
+        T*& half = to[along > 0 ? 0 : 1];
+        half = std::copy_n(points, D, half);
+      }
+      for (int i = 0; i < 2; ++i) std::fill(to[i], end[i], std::numeric_limits<T>::infinity());
+    });
+  });
+  return result;
+}
+
 // A set of 64-bit keys: a table with a free entry for every key that it may get.
 class Keys {
   std::vector<uint64_t> table;
@@ -267,6 +331,7 @@ std::vector<Operator> kept_operators() {
       {"kept_counts(Tensor evidence) -> Tensor", &boxed<kept_counts>},
       {"kept_points(Tensor evidence, Tensor rows) -> (Tensor, Tensor)", &boxed<kept_points>},
       {"kept_again(Tensor points, Tensor owners, Tensor evidence) -> Tensor", &boxed<kept_again>},
+      {"halves(Tensor evidence) -> (Tensor, Tensor)", &boxed<halves>},
       {"kept_moments(Tensor evidence) -> (Tensor, Tensor, Tensor)", &boxed<kept_moments>},
       {"follow_kept(Tensor evidence, Tensor counts, Tensor centers, Tensor means, Tensor scatters, "
        "Tensor raw_scale_tril, Tensor known, float floor) -> (Tensor, Tensor, Tensor, Tensor)",

@@ -12,35 +12,41 @@ constexpr double kFading = 0.5;  // as features.FADING
 
 // Whitened offset inv(L) offset.
 template <class T, int D>
-inline void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
-                          typename Simd<T>::V* z) {
+LARDHM_INLINE void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
+                                 typename Simd<T>::V* z) {
   const T* below = shape + Layout<D>::below;
   z[0] = offset[0] * shape[0];
   z[1] = (offset[1] - z[0] * below[0]) * shape[1];
   if constexpr (D == 3) z[2] = (offset[2] - z[0] * below[1] - z[1] * below[2]) * shape[2];
 }
 
-// Fade factor of a neighbor at the fraction t of the k-th center's squared distance, as
-// `features.neighbor_fade`.
+// Fade factor of a neighbor at the fraction t < 1 of the k-th center's squared distance, ...
 template <class T>
-inline typename Simd<T>::V fade_of(typename Simd<T>::V t) {
+LARDHM_INLINE typename Simd<T>::V fade_within(typename Simd<T>::V t) {
   using V = typename Simd<T>::V;
-  const V left = (T(1) - t) * T(1 / kFading);
-  const V u = left > 0 ? (left < T(1) ? left : V{} + T(1)) : V{};
+  const V left = T(1 / kFading) - t * T(1 / kFading);
+  const V u = left < T(1) ? left : V{} + T(1);
   return u * u * (T(3) - T(2) * u);
+}
+
+// ... and at any, as `features.neighbor_fade`.
+template <class T>
+LARDHM_INLINE typename Simd<T>::V fade_of(typename Simd<T>::V t) {
+  using V = typename Simd<T>::V;
+  return t < T(1) ? fade_within<T>(t) : V{};
 }
 
 // Whitened offset z = inv(L) (x - c) of a packet from one cluster.
 template <class T, int D>
-inline void whiten(const Packet<T, D>& packet, const T* center, const T* shape,
-                   typename Simd<T>::V* z) {
+LARDHM_INLINE void whiten(const Packet<T, D>& packet, const T* center, const T* shape,
+                          typename Simd<T>::V* z) {
   typename Simd<T>::V offset[D];
   for (int d = 0; d < D; ++d) offset[d] = packet.x[d] - center[d];
   whiten_offset<T, D>(offset, shape, z);
 }
 
 template <class T, int D>
-inline typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
+LARDHM_INLINE typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
   typename Simd<T>::V squared = z[0] * z[0];
   for (int d = 1; d < D; ++d) squared += z[d] * z[d];
   return exp_of<T>(squared * T(-0.5));
@@ -48,7 +54,7 @@ inline typename Simd<T>::V kernel_of(const typename Simd<T>::V* z) {
 
 // Its derivative by t.
 template <class T>
-inline typename Simd<T>::V fade_slope(typename Simd<T>::V t) {
+LARDHM_INLINE typename Simd<T>::V fade_slope(typename Simd<T>::V t) {
   using V = typename Simd<T>::V;
   const V u = (T(1) - t) * T(1 / kFading);
   return u > 0 ? (u < T(1) ? u * (u - T(1)) * T(6 / kFading) : V{}) : V{};
@@ -58,13 +64,9 @@ inline typename Simd<T>::V fade_slope(typename Simd<T>::V t) {
 template <class T, int D>
 inline typename Simd<T>::V feature_of(const Packet<T, D>& packet, const T* center,
                                       const T* shape) {
-  using V = typename Simd<T>::V;
-  V offset[D], z[D];
-  for (int d = 0; d < D; ++d) offset[d] = packet.x[d] - center[d];
-  whiten_offset<T, D>(offset, shape, z);
-  V squared = offset[0] * offset[0];
-  for (int d = 1; d < D; ++d) squared += offset[d] * offset[d];
-  return kernel_of<T, D>(z) * fade_of<T>(squared * packet.fading);
+  typename Simd<T>::V z[D];
+  whiten<T, D>(packet, center, shape, z);
+  return kernel_of<T, D>(z) * fade_of<T>(squared_distance(packet, center) * packet.fading);
 }
 
 template <class T, int D>

@@ -18,7 +18,7 @@ inline void exchange(I& a, I& b) {
 
 // A bitonic run of values, ascending.
 template <int N, class I>
-inline __attribute__((always_inline)) void merge_bitonic(I* value) {
+LARDHM_INLINE void merge_bitonic(I* value) {
   if constexpr (N > 1) {
     for (int i = 0; i < N / 2; ++i) exchange(value[i], value[i + N / 2]);
     merge_bitonic<N / 2>(value);
@@ -26,16 +26,14 @@ inline __attribute__((always_inline)) void merge_bitonic(I* value) {
   }
 }
 
-// Any values, ascending.
-template <int N, class I>
-inline __attribute__((always_inline)) void sort_values(I* value) {
-  if constexpr (N > 1) {
-    sort_values<N / 2>(value);
-    sort_values<N / 2>(value + N / 2);
-    for (int i = 0; i < N / 2; ++i) exchange(value[i], value[N - 1 - i]);
-    merge_bitonic<N / 2>(value);
-    merge_bitonic<N / 2>(value + N / 2);
-  }
+// Eight values, ascending, by the fewest exchanges.
+template <class I>
+LARDHM_INLINE void sort_eight(I* value) {
+  constexpr int kPairs[19][2] = {{0, 2}, {1, 3}, {4, 6}, {5, 7}, {0, 4}, {1, 5}, {2, 6},
+                                 {3, 7}, {0, 1}, {2, 3}, {4, 5}, {6, 7}, {2, 4}, {3, 5},
+                                 {1, 4}, {3, 6}, {1, 2}, {3, 4}, {5, 6}};
+#pragma GCC unroll 19
+  for (const auto& pair : kPairs) exchange(value[pair[0]], value[pair[1]]);
 }
 
 template <class I>
@@ -43,93 +41,81 @@ inline I largest_value() {
   return std::numeric_limits<std::decay_t<decltype(I{}[0])>>::max() - I{};
 }
 
-// The k smallest of what is inserted, lane by lane, as bits of non-negative floats: for a small k one
-// value after the other, ...
-template <class I, int K>
-struct Smallest {
-  static constexpr int kAtOnce = 1;
+// The k-th smallest of the distances that `next` gives, n >= k of them, lane by lane, as bits of
+// non-negative floats. For a small k one after the other finds its place among the smallest, ...
+template <class I, int K, class Next>
+inline I kth_of(int64_t n, const Next& next) {
   I value[K];
-
-  explicit Smallest(int) {
-    for (I& v : value) v = largest_value<I>();
-  }
-
-  inline void insert(I* given) {
+  for (I& v : value) v = largest_value<I>();
+  for (int64_t i = 0; i < n; ++i) {
+    I given = next(i);
 #pragma GCC unroll 16
-    for (int j = 0; j < K; ++j) exchange(value[j], *given);
+    for (int j = 0; j < K; ++j) exchange(value[j], given);
   }
-
-  I last() const { return value[K - 1]; }
-};
+  return value[K - 1];
+}
 
 // ... for any k the same, unless it is one of the usual ones, ...
-template <class I>
-struct SmallestOfAny {
-  static constexpr int kAtOnce = 1;
-  std::vector<I> value;
-
-  explicit SmallestOfAny(int k) : value(k, largest_value<I>()) {}
-
-  inline void insert(I* given) {
-    for (I& v : value) exchange(v, *given);
+template <class I, class Next>
+inline I kth_of_any(int64_t n, int k, const Next& next) {
+  std::vector<I> value(k, largest_value<I>());
+  for (int64_t i = 0; i < n; ++i) {
+    I given = next(i);
+    for (I& v : value) exchange(v, given);
   }
+  return value.back();
+}
 
-  I last() const { return value.back(); }
-};
-
-// ... for a larger k eight together: sorted, then merged into those kept.
-template <class I, int K>
-struct SmallestOfEights {
-  static constexpr int kAtOnce = 8, kKept = K > 8 ? 16 : 8;
+// ... for a larger k eight together: sorted, then merged into the 8 or 16 smallest. Of the last
+// eight only the largest that stays matters.
+template <class I, int K, class Next>
+LARDHM_INLINE I kth_of_eights(int64_t n, const Next& next) {
+  constexpr int kKept = K > 8 ? 16 : 8;
   static_assert(K <= kKept);
-  I value[kKept];
-
-  explicit SmallestOfEights(int) {
-    for (I& v : value) v = largest_value<I>();
+  I value[kKept], given[8];
+  const auto sorted_eight = [&](int64_t i, I* to) __attribute__((always_inline)) {
+    for (int j = 0; j < 8; ++j) to[j] = next(i + j);
+    sort_eight(to);
+  };
+  sorted_eight(0, value);
+  if constexpr (kKept == 16) {
+    sorted_eight(8, value + 8);
+    for (int i = 0; i < 8; ++i) exchange(value[i], value[15 - i]);
+    merge_bitonic<8>(value);
+    merge_bitonic<8>(value + 8);
   }
-
-  inline __attribute__((always_inline)) void insert(I* given) {
-    sort_values<kAtOnce>(given);
-    I* upper = value + kKept - kAtOnce;
-    for (int i = 0; i < kAtOnce; ++i) upper[i] = vmin(upper[i], given[kAtOnce - 1 - i]);
+  I* upper = value + kKept - 8;
+  for (int64_t i = kKept; i < n; i += 8) {
+    sorted_eight(i, given);
+    for (int j = 0; j < 8; ++j) upper[j] = vmin(upper[j], given[7 - j]);
+    if (K == kKept && i + 8 >= n) {
+      I largest = value[0];
+#pragma GCC unroll 16
+      for (int j = 1; j < kKept; ++j) largest = vmax(largest, value[j]);
+      return largest;
+    }
     merge_bitonic<kKept>(value);
   }
-
-  I last() const { return value[K - 1]; }
-};
-
-template <class I, int K>
-using KeptFor =
-    std::conditional_t<K == 0, SmallestOfAny<I>,
-                       std::conditional_t<(K < 8), Smallest<I, K>, SmallestOfEights<I, K>>>;
+  return value[K - 1];
+}
 
 // Squared distances of the packet to the listed centers (as bits, in `distance`); their k-th
-// smallest, lane by lane. Every step is rounded as in the definition, so that ties are the same.
+// smallest, lane by lane.
 template <class T, int D, int K>
 typename Simd<T>::I kth_distance(const Packet<T, D>& packet, const T* positions,
                                  const int32_t* list, int64_t n, int k,
                                  typename Simd<T>::I* distance) {
-  using V = typename Simd<T>::V;
   using I = typename Simd<T>::I;
-  using Kept = KeptFor<I, K>;
-  Kept smallest(k);
-  const auto squared_distance = [&](int64_t i) {
+  const auto next = [&](int64_t i) __attribute__((always_inline)) {
     const T* center = positions + int64_t(list[i]) * Layout<D>::position;
-    V squared = {};
-    for (int d = 0; d < D; ++d) {
-      const V offset = packet.x[d] - center[d];
-      squared = d == 0 ? rounded(offset * offset) : squared + rounded(offset * offset);
-    }
-    return distance[i] = (I)squared;
+    return distance[i] = (I)squared_distance<T, D>(packet, center);
   };
-  constexpr int kAtOnce = Kept::kAtOnce;
-  I together[kAtOnce];
-  for (int64_t i = 0; i < n; i += kAtOnce) {
-    for (int j = 0; j < kAtOnce; ++j)
-      together[j] = i + j < n ? squared_distance(i + j) : largest_value<I>();
-    smallest.insert(together);
-  }
-  return smallest.last();
+  if constexpr (K == 0)
+    return kth_of_any<I>(n, k, next);
+  else if constexpr (K < 8)
+    return kth_of<I, K>(n, next);
+  else
+    return kth_of_eights<I, K>(n, next);
 }
 
 // One function for each usual k, chosen once a call.

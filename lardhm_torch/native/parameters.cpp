@@ -25,7 +25,10 @@ Parameters<T, D>::Parameters(const Index& index_, const T* centers_, const T* ra
            Scaling scaling, bool all)
     : index(index_), centers(centers_), raw(raw_), weights(weights_),
       scale(T(std::sqrt(scaling.covariance_scale))), floor(T(scaling.min_lengthscale)) {
-  positions.allocate(index.header.count * Layout<D>::position);
+  constexpr int64_t kPosition = Layout<D>::position;
+  positions.allocate((index.header.count + 1) * kPosition);
+  std::fill_n(positions.data + index.header.count * kPosition, kPosition,
+              std::numeric_limits<T>::infinity());
   if (raw) shapes.allocate(index.header.count * Layout<D>::shape);
   if (!all) packed.assign(index.blocks, 0);
   if (!all) return;

@@ -35,7 +35,7 @@ struct Parameters {
   const Index& index;
   const T *centers, *raw, *weights;
   T scale, floor;
-  AlignedArray<T> positions, shapes;
+  AlignedArray<T> positions, shapes;  // the last position is infinitely far, of no cluster
   std::vector<char> packed;  // blocks; empty when all are
 
   Parameters(const Index& index, const T* centers, const T* raw, const T* weights, Scaling scaling,

@@ -40,6 +40,25 @@ int64_t block_size(const Engine<T, D>& engine, int64_t n, int64_t workers) {
   return coherent ? kSmallBlock : std::min(share, kLargeBlock);
 }
 
+// The thread's working memory, kept between calls unless it is large: to ask for it anew takes up to
+// a tenth of a query.
+template <class T, int D>
+struct OwnScratch {
+  static constexpr size_t kKept = size_t(1) << 18;  // points
+  Scratch<T, D>& scratch;
+
+  OwnScratch() : scratch(of_thread()) { scratch.radius = 0; }
+
+  ~OwnScratch() {
+    if (scratch.sorter.items.capacity() > kKept) scratch.sorter = Sorter();
+  }
+
+  static Scratch<T, D>& of_thread() {
+    static thread_local Scratch<T, D> scratch;
+    return scratch;
+  }
+};
+
 }  // namespace
 
 template <class T, int D>
@@ -52,9 +71,9 @@ void visit_all(const T* points, int64_t n, Parameters<T, D>& parameters, int64_t
   const int64_t blocks = (n + block - 1) / block;
   std::atomic<int64_t> next{0};
   run_tasks(std::min(blocks, threads), [&](int64_t) {
-    Scratch<T, D> scratch;
+    const OwnScratch<T, D> own;
     for (int64_t i = next++; i < blocks; i = next++)
-      engine.visit(i * block, std::min(n, (i + 1) * block), scratch, visitor);
+      engine.visit(i * block, std::min(n, (i + 1) * block), own.scratch, visitor);
   });
 }
 
@@ -65,10 +84,10 @@ void visit_parts(const T* points, int64_t n, Parameters<T, D>& parameters, int64
   const Engine<T, D> engine(points, parameters, k);
   const int64_t block = block_size(engine, n, parts);
   run_tasks(parts, [&](int64_t part) {
-    Scratch<T, D> scratch;
+    const OwnScratch<T, D> own;
     const int64_t begin = n * part / parts, end = n * (part + 1) / parts;
     for (int64_t i = begin; i < end; i += block)
-      engine.visit(i, std::min(end, i + block), scratch, *visitors[part]);
+      engine.visit(i, std::min(end, i + block), own.scratch, *visitors[part]);
   });
 }
 

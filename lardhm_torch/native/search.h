@@ -15,6 +15,7 @@ namespace lardhm {
 template <class T, int D>
 struct Visitor {
   virtual ~Visitor() = default;
+  virtual bool wants_bits() const { return true; }  // also of a packet whose neighbors all fade
   virtual void invalid(int64_t row) = 0;
   virtual void packet(const Packet<T, D>& packet, const Selection& selected) = 0;
 };

@@ -11,6 +11,8 @@
 #include <immintrin.h>
 #endif
 
+#define LARDHM_INLINE inline __attribute__((always_inline))
+
 namespace lardhm {
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__)
@@ -160,7 +162,7 @@ struct ExpConstants<double> {
 // exp(x) for x <= `highest`: 2^n times the Taylor series of the rest, |rest| <= ln(2) / 2; 0 below
 // `lowest`.
 template <class T>
-__attribute__((always_inline)) inline typename Simd<T>::V exp_of(typename Simd<T>::V x) {
+LARDHM_INLINE typename Simd<T>::V exp_of(typename Simd<T>::V x) {
   using V = typename Simd<T>::V;
   using U = typename Simd<T>::U;  // may overflow, where the result is 0
   using C = ExpConstants<T>;

@@ -62,7 +62,7 @@ void Sorter::counting_pass(int shift, int bits) {
 }
 
 void Sorter::sort(int key_bits) {
-  const int passes = key_bits <= 15 ? 1 : (key_bits + 10) / 11;
+  const int passes = key_bits <= 15 ? 1 : (key_bits + 11) / 12;
   for (int pass = 0; pass < passes; ++pass) {
     const int shift = key_bits * pass / passes;
     counting_pass(32 + shift, key_bits * (pass + 1) / passes - shift);

@@ -97,22 +97,24 @@ Tensor nearest_clusters(const Tensor& given_points, const Tensor& given_counts,
   return owners;
 }
 
-// Sums over points of the kernel values of each cluster, those of one thread.
+// Sums over points of the kernel values of each wanted cluster, those of one thread.
 template <class T, int D>
 struct SumVisitor final : Visitor<T, D> {
   const int32_t* order;
   const T *positions, *shapes;
+  const bool* wanted;        // by row
   std::vector<double> sums;  // by rank
 
-  SumVisitor(const Parameters<T, D>& parameters, int64_t count)
+  SumVisitor(const Parameters<T, D>& parameters, const bool* wanted_, int64_t count)
       : order(parameters.index.order), positions(parameters.positions.data),
-        shapes(parameters.shapes.data), sums(count) {}
+        shapes(parameters.shapes.data), wanted(wanted_), sums(count) {}
 
   void invalid(int64_t) override {}
 
   void packet(const Packet<T, D>& packet, const Selection& selected) override {
     for (int64_t j = 0; j < selected.size; ++j) {
       const int64_t rank = selected.rank[j];
+      if (!wanted[order[rank]]) continue;
       const auto value = feature_of<T, D>(packet, positions + rank * Layout<D>::position,
                                           shapes + rank * Layout<D>::shape);
       T lanes[Simd<T>::W];
@@ -124,12 +126,14 @@ struct SumVisitor final : Visitor<T, D> {
 };
 
 Tensor feature_sums(const Tensor& given_points, const Tensor& centers, const Tensor& raw,
-                    const Tensor& index, int64_t k, double covariance_scale,
-                    double min_lengthscale) {
+                    const Tensor& index, const Tensor& given_wanted, int64_t k,
+                    double covariance_scale, double min_lengthscale) {
   check_k(k);
-  const Tensor points = tidy(given_points);
+  const Tensor points = tidy(given_points), wanted = tidy(given_wanted);
   check_rows("points", points, centers);
   const int64_t n = points.size(0), count = centers.size(0);
+  check(wanted.scalar_type() == ScalarType::Bool && wanted.numel() == count,
+        "wanted must be (M,) bool, one per center");
   const Tensor weights = new_zeros(centers, {count});
   const MapTensors map(centers, raw, weights, index, covariance_scale, min_lengthscale);
   const Tensor sums = new_zeros(map.centers, {count});
@@ -141,7 +145,7 @@ Tensor feature_sums(const Tensor& given_points, const Tensor& centers, const Ten
     with_parameters<T, D>(map, n, [&](Parameters<T, D>& parameters) {
       std::vector<SumVisitor<T, D>> visitors;
       for (int64_t part = 0; part < parts_of(n, 8 * count, parameters); ++part)
-        visitors.emplace_back(parameters, count);
+        visitors.emplace_back(parameters, in<bool>(wanted), count);
       visit_parts<T, D>(in<T>(points), n, parameters, k, each_of<T, D>(visitors));
       for (int64_t rank = 0; rank < count; ++rank) {
         double sum = 0;
@@ -214,8 +218,8 @@ std::vector<Operator> update_operators() {
       {"nearest_clusters(Tensor points, Tensor counts, Tensor means, Tensor scatters, float floor, "
        "float radius) -> Tensor",
        &boxed<nearest_clusters>},
-      {"feature_sums(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, int k, "
-       "float covariance_scale, float min_lengthscale) -> Tensor",
+      {"feature_sums(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, "
+       "Tensor wanted, int k, float covariance_scale, float min_lengthscale) -> Tensor",
        &boxed<feature_sums>},
       {"reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
        "float covariance_scale, float min_lengthscale) -> Tensor",
