@@ -1,5 +1,4 @@
 import copy
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,18 +10,13 @@ from lardhm_torch import (
     LardHilbertMap,
     UpdateConfig,
     load_scans,
-    native,
     resize_optimizer,
     sample_rays,
     simulate_room,
     split_rays,
 )
 from lardhm_torch.learning import parameters
-from lardhm_torch.learning.clustering import cluster_points
 from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
-from lardhm_torch.learning.forgetting import DOUBT, GONE, OVERRULED, doubted, forget, trust
-from lardhm_torch.learning.map_state import new_rows
-from lardhm_torch.learning.regrouping import Rule, _divide
 
 F64 = torch.float64
 PAPER = UpdateConfig(as_in_paper=True)
@@ -192,7 +186,6 @@ def test_an_update_that_fails_or_is_interrupted_leaves_the_map_as_it_was(monkeyp
 
 @pytest.mark.parametrize("at", [1.0, 6.0], ids=["no growth", "growth"])
 def test_an_interrupt_while_the_result_is_taken_over_leaves_the_map_as_it_was(monkeypatch, at):
-    from lardhm_torch.learning import parameters
 
     model = wall_map()
     before, assign = copy.deepcopy(model), parameters.assign_rows
@@ -260,128 +253,6 @@ def test_one_new_point_and_one_new_class_are_enough_for_an_update():
     free = LardHilbertMap().fit(wall()[0][600:], torch.zeros(600), num_clusters=10)
     free.update(wall()[0][:600], torch.ones(600), num_clusters=10)
     assert (free(wall()[0][:600]) > 0.5).double().mean() > 0.95
-
-
-# --- what the map remembers ---
-
-
-def test_what_is_said_elsewhere_changes_nothing_here():
-    model = wall_map()
-    points = wall(seed=4)[0]
-    before = model(points).detach()
-    model.update(*wall(at=30.0), num_clusters=40)
-    torch.testing.assert_close(model(points).detach(), before, atol=1e-6, rtol=0)
-
-
-def test_new_points_beside_old_ones_do_not_destroy_what_was_known():
-    """The left half of a wall is seen again and again; the right half must not fade."""
-    model, (points, labels) = wall_map(), wall(seed=4)
-    right = points[:, 1] > 1.3
-    before = ((model(points) > 0.5) == (labels > 0.5))[right].double().mean()
-    for seed in range(10):
-        more, of_more = wall(seed=10 + seed)
-        model.update(more[more[:, 1] < 1.0], of_more[more[:, 1] < 1.0], seed=seed)
-    after = ((model(points) > 0.5) == (labels > 0.5))[right].double().mean()
-    assert after > before - 0.03
-
-
-def test_an_obstacle_that_rays_pass_through_fades_within_a_few_scans():
-    model = LardHilbertMap().fit(*wall(seed=0), num_clusters=40)
-    for seed in range(5):  # well known
-        model.update(*wall(seed=seed + 1), seed=seed)
-    beyond, labels = wall(seed=20, at=3.0)
-    rng = torch.Generator().manual_seed(0)
-    there = wall(seed=30)[0][:600]
-    assert (model(there) > 0.5).double().mean() > 0.95
-    scans = 0
-    while (model(there) > 0.5).double().mean() > 0.05:
-        assert scans < 10
-        open_space = torch.rand(6000, 3, generator=rng, dtype=F64) * 2
-        points = torch.cat([beyond[:600], open_space])
-        model.update(points, torch.cat([labels[:600], torch.zeros(6000)]), seed=scans)
-        scans += 1
-    assert scans >= 1
-    assert (model(beyond[:600]) > 0.5).double().mean() > 0.9
-
-
-def test_trust_in_a_contradicted_cluster_falls_and_returns_with_a_hit():
-    part = known_wall()
-    doubts = torch.tensor([0.0, DOUBT, 2 * DOUBT])
-    assert torch.equal(trust(doubts), torch.tensor([1.0, 1.0, 2.0**-8]))
-    doubted_part = replace(part, doubts=torch.full_like(part.doubts, 2 * DOUBT))
-    after = forget(doubted_part, part.doubts)
-    assert torch.equal(after.evidence, part.evidence)
-    assert torch.equal(after.fresh, kept_counts(part.evidence).to(after.fresh))
-    again = forget(replace(after, doubts=part.doubts, fresh=part.fresh), after.doubts)
-    assert torch.equal(again.fresh, kept_counts(part.evidence).to(after.fresh))
-    assert torch.equal(forget(part, part.doubts).fresh, part.fresh)
-
-
-def test_clusters_that_stay_in_doubt_and_overruled_unknown_ones_lose_their_points():
-    part = known_wall()
-    gone = replace(part, doubts=torch.where(torch.arange(len(part)) == 0, GONE + 1, 0.0))
-    after = forget(gone, gone.doubts)
-    assert (kept_counts(after.evidence) == 0).tolist() == [True] + [False] * (len(part) - 1)
-    unknown = replace(
-        part,
-        is_occupied=torch.zeros_like(part.is_occupied),
-        counts=torch.zeros_like(part.counts),
-        losses=torch.where(torch.arange(len(part)) == 1, 2 * OVERRULED, 0.0),
-    )
-    left = kept_counts(forget(unknown, unknown.doubts).evidence)
-    assert (left == 0).tolist() == [n == 1 for n in range(len(part))]
-
-
-def known_wall():
-    points = wall()[0][:600]
-    clusters = cluster_points(points, 4, torch.Generator().manual_seed(0))
-    owners = torch.cdist(points, clusters.means).argmin(dim=1)
-    evidence = keep_points(points, owners, len(clusters))
-    return new_rows(clusters, torch.ones(len(clusters), dtype=torch.bool), 0.01, evidence)
-
-
-def test_halves_of_a_cluster_in_doubt_are_in_doubt():
-    part = replace(known_wall(), doubts=torch.full((4,), 2.0), losses=torch.ones(4))
-    rule = Rule(occupied=8, grows=True, few=False, split_loss=0.01, floor=0.01)
-    groups = _divide(part, rule)
-    assert groups.changed.sum() == 8
-    assert torch.equal(groups.state.doubts, torch.full((8,), 2.0))
-
-
-def test_clusters_have_the_covariances_of_their_kept_points_however_often_they_were_seen():
-    model = LardHilbertMap().fit(*wall(), num_clusters=40)
-    for seed in range(1, 31):
-        model.update(*wall(seed), seed=seed, config=UpdateConfig(split_loss=1e9))
-    found = parameters.read_state(model).clusters
-    kept = evidence_moments(model.evidence)
-    assert found.counts.max() > 3 * EVIDENCE
-    follows = (found.means - kept.means).abs().amax(
-        dim=1
-    ) < 1e-5  # its points changed since the fit
-    assert follows.sum() > 30
-    ours, theirs = found.covariances[follows], kept.covariances[follows]
-    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-6)
-
-
-def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
-    points = wall()[0]
-    rng = torch.Generator().manual_seed(0)
-    clusters = cluster_points(points[:600], 8, rng)
-    known = new_rows(clusters, torch.arange(len(clusters)) % 2 > 0, 0.01)
-    kernel = LardHilbertMap().kernel
-    hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
-    both, labels = torch.cat([hits, free]), torch.tensor([1.0, 0.0]).repeat_interleave(600)
-    passed = forgetting_state(known, both, labels, kernel)
-    assert torch.equal(trust(passed.doubts) < 1, known.is_occupied)
-    hit_again = forgetting_state(passed, free, torch.ones(600), kernel)
-    assert (trust(hit_again.doubts) == 1).all()
-    nothing_there = forgetting_state(known, hits, torch.zeros(600), kernel)
-    assert (trust(nothing_there.doubts) == 1).all()
-
-
-def forgetting_state(known, points, labels, kernel):
-    index = native.build_index(known.centers, kernel.num_neighbors)
-    return replace(known, doubts=doubted(known, points, labels, kernel, index))
 
 
 # --- real scans ---
