@@ -9,7 +9,7 @@ from tiled_maps import tiled
 
 from lardhm_torch import LardHilbertMap, sample_rays, simulate_room, surface_distance
 from lardhm_torch.queries.clearance import clearance
-from lardhm_torch.queries.grids import EVIDENCE
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN
 
 
 def fitted_map(seed=0):
@@ -22,7 +22,7 @@ def fitted_map(seed=0):
 
 def test_clearance_of_a_ball_is_the_distance_to_where_it_is_clearly_occupied():
     points = torch.tensor([[2.0, 0, 0], [0.0, -3.0, 0.0], [0.4, 0, 0]]).double()
-    expected = points.norm(dim=1) - radius_where(EVIDENCE)
+    expected = points.norm(dim=1) - radius_where(LOG_ODDS_MARGIN)
     torch.testing.assert_close(clearance(ball(), points).detach(), expected)
 
 
@@ -35,7 +35,7 @@ def test_nothing_clearly_occupied_is_nearer_than_the_clearance():
     assert free.sum() > 50
     around = torch.randn(300, 200, 3, generator=rng, dtype=torch.float64)
     around = around / around.norm(dim=2, keepdim=True) * distance.clamp(min=0)[:, None, None]
-    assert (model.log_odds(points[:, None] + around)[free] <= EVIDENCE).all()
+    assert (model.log_odds(points[:, None] + around)[free] <= LOG_ODDS_MARGIN).all()
 
 
 @settings(deadline=None, max_examples=20)
@@ -80,7 +80,7 @@ def test_in_a_room_the_clearance_is_below_the_distance_and_not_far_below():
     spread = torch.randn(len(pick), 3, 1, generator=rng)
     around = (model.centers[pick] + (model.scale_tril[pick] @ spread).squeeze(2)).double()
     around += model.origin
-    obstacles = around[model.log_odds(around) > EVIDENCE]
+    obstacles = around[model.log_odds(around) > LOG_ODDS_MARGIN]
     assert len(obstacles) > 10_000
     true = torch.cat([torch.cdist(p, obstacles).amin(dim=1) for p in points.split(100)])
     found = clearance(model, points)

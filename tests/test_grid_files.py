@@ -6,7 +6,7 @@ import torch
 
 from lardhm_torch import LardHilbertMap, grid, load_scans, sample_rays, simulate_room
 from lardhm_torch.io.grid_files import save_grid
-from lardhm_torch.queries.grids import EVIDENCE, map_bounds
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN, map_bounds
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +112,11 @@ def test_octomap_gets_the_classes_of_known_cells_and_no_others(room, octomap, tm
     assert tree.getResolution() == 0.4
     assert np.rint((edges / 0.4) ** 3).sum() == count  # pruned leaves hold several cells
     log_odds = cell_log_odds(room, centers[edges < 0.5], 0.4)
-    assert (np.abs(log_odds) > EVIDENCE - 1e-3).all()
+    assert (np.abs(log_odds) > LOG_ODDS_MARGIN - 1e-3).all()
     assert np.array_equal(log_odds > 0, occupied[edges < 0.5])
     lower, upper = map_bounds(room)
     everywhere = (grid(lower, upper, 0.4).reshape(-1, 3) / 0.4).floor() * 0.4 + 0.2
-    known = np.abs(cell_log_odds(room, everywhere, 0.4)) >= EVIDENCE
+    known = np.abs(cell_log_odds(room, everywhere, 0.4)) >= LOG_ODDS_MARGIN
     assert known.sum() == pytest.approx(count, rel=0.002)  # tails reach out of three deviations
 
 
@@ -181,7 +181,7 @@ def test_a_map_of_real_scans_goes_to_octomap_and_back(data, octomap, tmp_path):
     tree.readBinary(str(tmp_path / "map.bt").encode())
     places = torch.cat([scans.hits[::20], (scans.ends[::50] + scans.ray_origins[::50]) / 2])
     log_odds = cell_log_odds(model, (places / 0.2).floor() * 0.2 + 0.1, 0.2)
-    expected = np.where(np.abs(log_odds) < EVIDENCE, -1, log_odds > 0)
+    expected = np.where(np.abs(log_odds) < LOG_ODDS_MARGIN, -1, log_odds > 0)
     assert np.array_equal(tree.getLabels(places.numpy()), expected)
     assert {-1, 0, 1} == set(expected.tolist())
 

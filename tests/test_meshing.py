@@ -81,7 +81,7 @@ def random_map(seed, clusters=12):
 
 @pytest.mark.parametrize("threshold", [0.6, 0.8, 0.95])
 def test_the_mesh_of_a_ball_is_the_sphere_where_the_probability_is_the_threshold(threshold):
-    mesh = level_mesh(ball(), 0.03, threshold, evidence=None)
+    mesh = level_mesh(ball(), 0.03, threshold, log_odds_margin=None)
     radius = radius_where(threshold)
     lengths = np.linalg.norm(mesh.vertices, axis=1)
     np.testing.assert_allclose(lengths, radius, atol=0.002)  # linear between lattice points
@@ -111,7 +111,7 @@ def triangles(mesh):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_mesh_is_that_of_the_whole_lattice(seed):
     model, bounds = random_map(seed), ([-1.6] * 3, [1.6] * 3)
-    mesh = level_mesh(model, 0.08, 0.7, bounds, evidence=None)
+    mesh = level_mesh(model, 0.08, 0.7, bounds, log_odds_margin=None)
     with torch.no_grad():
         values = model.log_odds(grid(*bounds, 0.08)).numpy().astype(np.float32)
     cut = plain_march(values[None], math.log(0.7 / 0.3), np.array([[40, 40, 40]]))
@@ -166,7 +166,7 @@ def test_only_blocks_near_occupied_clusters_are_evaluated():
     model = GaussianMap(
         [[0.0, 0, 0], [40.0, 40.0, 40.0]], (0.1 * torch.eye(3)).repeat(2, 1, 1), [6.0, 6.0]
     )
-    mesh = level_mesh(model, 0.05, 0.7, color=None, evidence=None)
+    mesh = level_mesh(model, 0.05, 0.7, color=None, log_odds_margin=None)
     assert mesh.body_count == 2
     assert model.num_points < 20 * 25**3  # the whole lattice would have 800³ points
 
@@ -206,7 +206,7 @@ def test_a_map_that_knows_only_free_space_gives_a_mesh_without_faces():
 
 def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
     model = wall_seen_from_the_left()
-    everything = level_mesh(model, 0.04, evidence=None)
+    everything = level_mesh(model, 0.04, log_odds_margin=None)
     measured = level_mesh(model, 0.04)
     assert (everything.triangles_center[:, 0] > 0.1).any()  # the back, where only tails are left
     assert 0 < len(measured.faces) < len(everything.faces)
@@ -217,14 +217,14 @@ def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
 
 def test_below_one_half_the_surface_bounds_the_known_free_space():
     free = GaussianMap(torch.zeros(1, 3), SIGMA * torch.eye(3)[None], [-WEIGHT])
-    mesh = level_mesh(free, 0.03, threshold=0.2, evidence=None)
+    mesh = level_mesh(free, 0.03, threshold=0.2, log_odds_margin=None)
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), radius_where(0.8), atol=0.002)
     assert mesh.volume < 0  # its normals point inward, into the free space
 
 
 @pytest.mark.parametrize("color", ["height", "cluster", "probability"])
 def test_every_vertex_has_a_color(color):
-    mesh = level_mesh(random_map(2), 0.08, 0.7, color=color, evidence=None)
+    mesh = level_mesh(random_map(2), 0.08, 0.7, color=color, log_odds_margin=None)
     assert mesh.visual.kind == "vertex"
     assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 1
@@ -235,7 +235,7 @@ def test_colors_by_cluster_and_by_probability_are_those_of_the_nearest_cluster()
         [[-0.5, 0, 0], [0.5, 0, 0]], (0.2 * torch.eye(3)).repeat(2, 1, 1), [4.0, 8.0]
     )
     for color in ("cluster", "probability"):
-        mesh = level_mesh(model, 0.05, 0.7, color=color, evidence=None)
+        mesh = level_mesh(model, 0.05, 0.7, color=color, log_odds_margin=None)
         left = mesh.vertices[:, 0] < 0
         shades = [np.unique(mesh.visual.vertex_colors[side], axis=0) for side in (left, ~left)]
         assert [len(shade) for shade in shades] == [1, 1]
@@ -249,7 +249,7 @@ def test_colors_by_variance_are_dark_where_the_map_is_sure():
     points[800:, 0] *= 0.8
     labels = (torch.arange(1600) < 800).float()
     model = LardHilbertMap().fit(points, labels).fit_uncertainty(points, labels)
-    mesh = level_mesh(model, 0.05, color="variance", evidence=None)
+    mesh = level_mesh(model, 0.05, color="variance", log_odds_margin=None)
     variance = model.variance(torch.as_tensor(np.array(mesh.vertices))).numpy()
     brightness = np.asarray(mesh.visual.vertex_colors)[:, :3].sum(axis=1)
     low, high = np.quantile(variance, [0.2, 0.8])
@@ -274,7 +274,7 @@ def test_without_color_the_mesh_has_none():
         ({"threshold": 0.0}, "threshold must be between 0 and 1, both excluded; got 0.0"),
         ({"color": "pink"}, "color must be one of height, cluster, probability, variance, None"),
         ({"color": "variance"}, "model must have a variance; GaussianMap has none"),
-        ({"evidence": -1.0}, "evidence must be >= 0, or None"),
+        ({"log_odds_margin": -1.0}, "log_odds_margin must be >= 0, or None"),
         ({"bounds": ([1, 1, 1], [0, 0, 0])}, "lower <= upper"),
         ({"bounds": ([0, 0], [1, 1])}, r"bounds must have 3 coordinates; got 2"),
     ],

@@ -12,7 +12,7 @@ from lardhm_torch.queries.clearance import clearance
 from lardhm_torch.queries.collision import expected_range, free_probability
 from lardhm_torch.queries.distance import signed_distance
 from lardhm_torch.queries.exploration import information_gain
-from lardhm_torch.queries.grids import EVIDENCE
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN
 from lardhm_torch.queries.raycasting import raycast, surface_step
 
 
@@ -56,7 +56,7 @@ def test_the_probability_at_the_end_of_a_ray_is_the_threshold_and_lower_before()
     )
     shares = torch.linspace(0, 1, 200, dtype=torch.float64)[:, None, None]
     before = model.log_odds(starts[met] + shares * (ends - starts[met]))
-    assert (before <= math.log(0.6 / 0.4) + EVIDENCE).all()
+    assert (before <= math.log(0.6 / 0.4) + LOG_ODDS_MARGIN).all()
 
 
 def test_ranges_do_not_depend_on_how_rays_are_batched(monkeypatch):
@@ -80,10 +80,10 @@ def naive_range(model, start, direction, max_range, level, step, surface):
         value = float(model.log_odds(start + depth * direction))
         if found is None and value <= level:
             below = depth
-        if found is None and value > level + EVIDENCE:
+        if found is None and value > level + LOG_ODDS_MARGIN:
             found, best = depth, -math.inf
         if found is not None:
-            if value < best - EVIDENCE:
+            if value < best - LOG_ODDS_MARGIN:
                 break
             if value > best:
                 peak, best = depth, value
@@ -173,7 +173,7 @@ def test_from_unknown_space_a_ray_ends_where_the_obstacle_becomes_clear():
     ranges = raycast(
         ball(), torch.tensor([-1.0, 0, 0]), torch.tensor([[1.0, 0, 0]]), 5.0, surface="crossing"
     )
-    assert float(ranges) == pytest.approx(1 - radius_where(EVIDENCE), abs=1e-5)
+    assert float(ranges) == pytest.approx(1 - radius_where(LOG_ODDS_MARGIN), abs=1e-5)
 
 
 def test_no_rays_give_no_ranges():

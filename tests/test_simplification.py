@@ -30,7 +30,7 @@ def test_a_sphere_of_fewer_faces_is_closed_round_and_keeps_its_colors(needs_libr
 
 
 def test_what_is_closed_stays_closed(needs_library):
-    mesh = extract_mesh(ball(), 0.02, 0.73, surface="crossing", evidence=None, color=None)
+    mesh = extract_mesh(ball(), 0.02, 0.73, surface="crossing", log_odds_margin=None, color=None)
     fewer = simplify_mesh(mesh, 500)
     assert mesh.is_watertight
     assert fewer.is_watertight

@@ -143,7 +143,7 @@ def test_join_takes_two_folders_or_two_map_files(tmp_path, files, capsys):
     ("options", "message"),
     [
         (["-o", "elsewhere.pt"], "--output must be omitted"),
-        (["--clusters", "5"], "--clusters and --radius do not apply to tiled maps"),
+        (["--clusters", "5"], "--clusters, --radius and --max-age do not apply to tiled maps"),
     ],
 )
 def test_update_of_a_folder_refuses_what_it_cannot_do(tmp_path, files, capsys, options, message):

@@ -262,7 +262,7 @@ def test_a_mesh_has_no_seam(dtype, tmp_path, monkeypatch):
     tiles = tiled(model, tmp_path, monkeypatch, block_clusters=1)
     assert len(tiles.manifest.tiles) == 8
     single, ours = (
-        extract_mesh(m, 0.04, 0.7, surface="crossing", evidence=None)
+        extract_mesh(m, 0.04, 0.7, surface="crossing", log_odds_margin=None)
         for m in (tiles.merge(), tiles)
     )
     assert single.is_watertight

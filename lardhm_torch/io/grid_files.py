@@ -23,7 +23,7 @@ from lardhm_torch.queries.channels import check_channel
 from lardhm_torch.queries.distance import signed_distance
 from lardhm_torch.queries.grids import (
     BLOCK_POINTS,
-    EVIDENCE,
+    LOG_ODDS_MARGIN,
     cluster_boxes,
     grid_axes,
     map_bounds,
@@ -281,5 +281,5 @@ def _known_cells(
         centers = first + resolution * index[(index < cells).all(dim=1)].double()
         points = (centers[:, None] + parts).to(model.origin.device)
         log_odds = model.log_odds(points).float().amax(dim=1).cpu()
-        known = log_odds.abs() >= EVIDENCE
+        known = log_odds.abs() >= LOG_ODDS_MARGIN
         yield centers[known], log_odds[known]

@@ -14,7 +14,7 @@ from torch import Tensor
 from lardhm_torch.io.atomic_files import replaced_file
 from lardhm_torch.maps import OccupancyMap, TensorLike, reads_copy, to_tensor
 from lardhm_torch.queries.grids import (
-    EVIDENCE,
+    LOG_ODDS_MARGIN,
     cluster_boxes,
     grid_axes,
     lattice_values,
@@ -232,8 +232,8 @@ def _tile(
     values = lattice_values(model, axes + levels, probability=False).float().cpu().numpy()
     values = values.reshape(counts[0], 2, counts[1], 2, -1)
     highest, lowest = values.max(axis=(1, 3, 4)), values.min(axis=(1, 3, 4))
-    free = np.where(lowest <= -EVIDENCE, lowest, UNSEEN)
-    return np.where(highest >= EVIDENCE, highest, free)
+    free = np.where(lowest <= -LOG_ODDS_MARGIN, lowest, UNSEEN)
+    return np.where(highest >= LOG_ODDS_MARGIN, highest, free)
 
 
 def _cropped(log_odds: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -115,8 +115,8 @@ WRITERS: dict[str, Callable[[Path, Columns], None]] = {".ply": write_ply, ".pcd"
 def save_scans(scans: Scans, path: str | os.PathLike[str]) -> None:
     """Write scans with their channels as ``.npz``, or as the points of ``.ply`` or ``.pcd``, atomically.
 
-    `load_scans` reads all three formats. Scans without rays are lost in .ply and .pcd, because they
-    have no points.
+    `load_scans` reads all three formats. Scans without rays and time stamps are lost in .ply and
+    .pcd, which have no place for them.
 
     Args:
         scans: range scans, world frame.

@@ -17,7 +17,7 @@ from lardhm_torch.maps import (
     to_tensor,
 )
 from lardhm_torch.queries.faces import kernel_tensors, surface_faces
-from lardhm_torch.queries.grids import EVIDENCE, threshold_log_odds
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN, threshold_log_odds
 from lardhm_torch.queries.nearest_face import (
     Faces,
     height_and_side,
@@ -26,7 +26,7 @@ from lardhm_torch.queries.nearest_face import (
     to_nearest,
 )
 
-MIN_THRESHOLD = 0.27  # log-odds of -1: `EVIDENCE` above it is unknown space
+MIN_THRESHOLD = 0.27  # log-odds of -1: `LOG_ODDS_MARGIN` above it is unknown space
 LATTICE = 7  # points along each axis of a cluster at which the map is queried
 NEARLY = 0.5  # log-odds so little below those of an obstacle count, too: one may lie in between
 CHUNK_POINTS = 1 << 17
@@ -36,8 +36,8 @@ CHUNK_POINTS = 1 << 17
 def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -> Tensor:
     """Lower bound on the distance to the nearest obstacle; differentiable.
 
-    An obstacle is where the log-odds exceed those of the threshold by `EVIDENCE`, as for `raycast`.
-    The result is the larger of two lower bounds.
+    An obstacle is where the log-odds exceed those of the threshold by `LOG_ODDS_MARGIN`, as for
+    `raycast`. The result is the larger of two lower bounds.
 
     - At most k clusters contribute to the log-odds of a point, so one of them contributes at least
       1/k. Therefore an obstacle lies in the ellipsoid |inv(L) (x - c)| <= E of a cluster of positive
@@ -67,7 +67,7 @@ def clearance(model: OccupancyMap, points: TensorLike, threshold: float = 0.5) -
         raise ValueError(f"points must be (..., {model.dim}); got {tuple(points.shape)}")
     model = in_memory(model)
     local = points.reshape(-1, model.dim) - model.origin
-    plates = obstacle_plates(model, threshold_log_odds(threshold) + EVIDENCE)
+    plates = obstacle_plates(model, threshold_log_odds(threshold) + LOG_ODDS_MARGIN)
     bounds = [to_nearest(local, part, torch.inf)[0] for part in plates]
     return torch.maximum(*bounds).reshape(points.shape[:-1])
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, TensorLike, local_parts, reads_map, to_tensor
 from lardhm_torch.queries.faces import surface_faces
-from lardhm_torch.queries.grids import EVIDENCE, cluster_boxes
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN, cluster_boxes
 from lardhm_torch.queries.nearest_face import to_nearest
 
 MARGIN = 1.0  # [m] around a box: clusters of the faces in it
@@ -89,7 +89,7 @@ def _distances(model: OccupancyMap, points: Tensor, max_distance: float, to_mean
     behind = (result.detach() < 0).nonzero().squeeze(1)
     if len(behind):
         with torch.no_grad():
-            is_free = model.log_odds(points.detach()[behind]) < -EVIDENCE
+            is_free = model.log_odds(points.detach()[behind]) < -LOG_ODDS_MARGIN
         result = result * torch.ones_like(result).index_fill_(0, behind[is_free], -1.0)
     if to_mean and len(faces.noise):
         result = result + torch.where(nearest >= 0, faces.noise[nearest.clamp(min=0)], 0.0)

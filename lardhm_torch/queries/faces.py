@@ -27,7 +27,7 @@ from lardhm_torch.maps import (
     num_neighbors,
     stored_moments,
 )
-from lardhm_torch.queries.grids import EVIDENCE
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN
 from lardhm_torch.queries.nearest_face import Faces, face_distances, nearest_faces
 
 EDGE = math.sqrt(3)  # half edge of a uniform distribution, in standard deviations
@@ -182,7 +182,7 @@ def _make_plates(
     inside = log_odds(torch.zeros_like(centers)[:, None]).squeeze(1)
     ahead = half.new_tensor(SIDES) + half[:, :1]  # (B, S)
     normals = ahead[:, :, None] * axes[:, None, :, 0]
-    seen = [log_odds(side * normals).amin(dim=1) < -EVIDENCE for side in (1, -1)]
+    seen = [log_odds(side * normals).amin(dim=1) < -LOG_ODDS_MARGIN for side in (1, -1)]
     limit = (FADES * inside)[:, None]
     steps = torch.arange(1, STEPS + 1, device=rows.device) / STEPS
     ends = [torch.zeros_like(centers) for _ in range(2)]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch.maps import OccupancyMap, TensorLike, reads_map
-from lardhm_torch.queries.grids import EVIDENCE, grid_axes, lattice_values
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN, grid_axes, lattice_values
 
 WALL_MARGIN = 0.3  # [m] around obstacles, where log-odds pass from free to occupied
 POINTS_AT_ONCE = 1 << 22
@@ -83,7 +83,7 @@ def _borders(log_odds: np.ndarray, layers: int) -> np.ndarray:
     """Free points beside an unknown one that is farther than some layers from the occupied points."""
     from scipy.ndimage import binary_dilation, maximum_filter
 
-    occupied, free = log_odds > EVIDENCE, log_odds < -EVIDENCE
+    occupied, free = log_odds > LOG_ODDS_MARGIN, log_odds < -LOG_ODDS_MARGIN
     if layers > 0:
         occupied = maximum_filter(occupied, 2 * layers + 1, mode="constant")
     return free & binary_dilation(~occupied & ~free)

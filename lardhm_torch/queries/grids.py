@@ -22,8 +22,8 @@ from lardhm_torch.queries.memory import check_memory
 
 BLOCK_POINTS = 1 << 20  # points evaluated at a time
 NUM_STDS = 3.0  # half edge of a cluster's box; a kernel is exp(-3^2 / 2) = 1 % of its peak there
-EVIDENCE = 1.0  # margin of log-odds beyond a threshold that counts as evidence of a measurement;
-# the tails of kernels in unmeasured space stay below it
+# Log-odds beyond a threshold from which on a place counts as measured: tails of kernels stay below it.
+LOG_ODDS_MARGIN = 1.0
 SURFACES = (
     "peak",
     "crossing",

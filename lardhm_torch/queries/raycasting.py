@@ -21,7 +21,7 @@ from lardhm_torch.maps import (
     stored_thickness_counts,
     to_tensor,
 )
-from lardhm_torch.queries.grids import BLOCK_POINTS, EVIDENCE, SURFACES, threshold_log_odds
+from lardhm_torch.queries.grids import BLOCK_POINTS, LOG_ODDS_MARGIN, SURFACES, threshold_log_odds
 
 BINS_PER_OCTAVE = 16  # of the histogram of thicknesses: neighboring bins differ by 4 %
 BISECTIONS = 16  # reduce a step of 5 cm to less than 1 µm
@@ -84,7 +84,7 @@ def raycast(
     starts, headings = unit_rays(model, origins, directions, max_range, step)
     level = threshold_log_odds(threshold)
     step = min(surface_step(model) if step is None else step, max_range)
-    march = March(step, max_range, level, level + EVIDENCE, surface == "peak")
+    march = March(step, max_range, level, level + LOG_ODDS_MARGIN, surface == "peak")
     ranges = starts.new_full((len(starts),), torch.inf)
     ends = starts + max_range * headings
     for rows, part in local_parts(model, starts.minimum(ends), starts.maximum(ends)):
@@ -204,9 +204,9 @@ def _ridge_depths(
 
 
 def first_peak(log_odds: Tensor) -> Tensor:
-    """(N, S) log-odds along N lines -> (N,) index of the largest before they fall by `EVIDENCE`."""
+    """(N, S) log-odds along N lines -> (N,) index of the largest before a fall of `LOG_ODDS_MARGIN`."""
     highest = log_odds.cummax(dim=1)
-    fallen = log_odds < highest.values - EVIDENCE
+    fallen = log_odds < highest.values - LOG_ODDS_MARGIN
     last = torch.full_like(fallen[:, 0], log_odds.shape[1] - 1, dtype=torch.long)
     end = torch.where(fallen.any(dim=1), fallen.to(torch.uint8).argmax(dim=1), last)
     return highest.indices.gather(1, end[:, None]).squeeze(1)

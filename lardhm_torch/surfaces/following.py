@@ -23,9 +23,7 @@ from lardhm_torch.surfaces.marching import Faces, march_blocks
 BATCH_BLOCKS = 1024  # examined at a time
 REGION_EDGE = 10.0  # [m] within which the surface is followed before other tiles are loaded
 PROBES = (1.0, 2.0, 3.0)  # standard deviations in front of and behind a vertex, where it is tested
-FREE_EVIDENCE = (
-    2.0  # how much more evidence is needed in front, where free space can leak through walls
-)
+FREE_FACTOR = 2.0  # on the margin in front, where free space can leak through walls
 SEED_RADII = torch.linspace(0, 4.5, 10)  # standard deviations from a center
 SEED_CLUSTERS = 1 << 12  # whose lines are evaluated at a time
 
@@ -36,22 +34,22 @@ class Rule(NamedTuple):
     Attributes:
         level: log-odds of the surface.
         sign: of the weights of the supporting clusters.
-        evidence: log-odds beyond the level on both sides of a face; None: none is needed.
+        log_odds_margin: required beyond the level on both sides of a face; None: none.
     """
 
     level: float
     sign: int
-    evidence: float | None
+    log_odds_margin: float | None
 
     @property
     def lowest(self) -> float:
         """Log-odds below which space in front of a face is known to be free."""
-        return self.level - FREE_EVIDENCE * (self.evidence or 0.0)
+        return self.level - FREE_FACTOR * (self.log_odds_margin or 0.0)
 
     @property
     def highest(self) -> float:
         """Log-odds above which space behind a face is known to be occupied."""
-        return self.level + (self.evidence or 0.0)
+        return self.level + (self.log_odds_margin or 0.0)
 
 
 class Sheet(NamedTuple):
@@ -79,8 +77,8 @@ def follow_surface(
     """The parts of a level set that can be reached from some blocks over supported faces.
 
     A vertex is supported if, within three standard deviations of the nearest supporting cluster (its
-    smallest), the log-odds exceed the level by ``evidence`` behind it, and fall below it by
-    `FREE_EVIDENCE` times as much in front of it. A face is kept if its three vertices are supported.
+    smallest), the log-odds exceed the level by ``log_odds_margin`` behind it, and fall below it by
+    `FREE_FACTOR` times as much in front of it. A face is kept if its three vertices are supported.
 
     Args:
         model: the map.
@@ -116,7 +114,7 @@ def seed_blocks(model: OccupancyMap, lattice: Lattice, rule: Rule) -> np.ndarray
     """Blocks in which the level set crosses a line that starts at the center of a supporting cluster.
 
     From each center, lines run along the principal axes and between all three of them, as far as
-    `SEED_RADII`. Lines without evidence on either side of the level count only if none is needed.
+    `SEED_RADII`. Lines without the margin on either side of the level count only if none is required.
     """
     ways = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)), dtype=torch.float64)
     ways = ways[(ways.abs().sum(dim=1) == 1) | (ways.abs().sum(dim=1) == 3)]
@@ -133,7 +131,7 @@ def seed_blocks(model: OccupancyMap, lattice: Lattice, rule: Rule) -> np.ndarray
             log_odds = model.log_odds(lines)
             inside = log_odds > rule.level
             crossed = inside[1:] != inside[:-1]
-            if rule.evidence is not None:
+            if rule.log_odds_margin is not None:
                 crossed &= log_odds.amax(dim=0) > rule.highest
                 crossed &= log_odds.amin(dim=0) < rule.lowest
             ends = torch.cat([lines[1:][crossed], lines[:-1][crossed]])
@@ -202,9 +200,9 @@ class _Follower:
         return -torch.nn.functional.normalize(gradient, dim=1)
 
     def _supported(self, points: Tensor, normals: Tensor, thickness: Tensor) -> Tensor:
-        """Ascending rows of the points with evidence in front of them and behind them."""
+        """Ascending rows of the points with the margin in front of them and behind them."""
         rows = torch.arange(len(points), device=points.device)
-        if self.rule.evidence is None:
+        if self.rule.log_odds_margin is None:
             return rows
         steps = normals * thickness[:, None]
         depths = torch.tensor(PROBES, dtype=torch.float64, device=points.device)[:, None, None]

@@ -19,7 +19,7 @@ from lardhm_torch.maps import (
     to_tensor,
 )
 from lardhm_torch.queries.grids import (
-    EVIDENCE,
+    LOG_ODDS_MARGIN,
     SURFACES,
     cluster_boxes,
     grid_axes,
@@ -45,7 +45,7 @@ def extract_mesh(
     *,
     surface: str = "peak",
     color: str | None = "height",
-    evidence: float | None = EVIDENCE,
+    log_odds_margin: float | None = LOG_ODDS_MARGIN,
     progress: bool = False,
 ) -> trimesh.Trimesh:
     """Surface mesh of occupied space; normals point into free space.
@@ -63,9 +63,9 @@ def extract_mesh(
 
     A face is kept only if there is measured occupied space behind it and free space in front of it.
     Within three standard deviations (the smallest) of the nearest supporting cluster, the log-odds must
-    exceed those of the threshold by ``evidence`` behind each vertex, and fall below them by twice as
-    much in front. Without this rule, there would be faces in unmeasured space, where the log-odds vary
-    around 0, and on the backs of walls. The rule does not depend on the resolution.
+    exceed those of the threshold by ``log_odds_margin`` behind each vertex, and fall below them by twice
+    as much in front. Without this rule, there would be faces in unmeasured space, where the log-odds
+    vary around 0, and on the backs of walls. The rule does not depend on the resolution.
 
     Args:
         model: a 3-D map.
@@ -80,8 +80,8 @@ def extract_mesh(
             map ("color", "intensity", "class", ...; gray where it is unknown), or None. Meshes
             colored by class have the class numbers as vertex attribute "label", -1 where unknown,
             which `save_mesh` writes to .ply.
-        evidence: margin of the log-odds required on both sides of a face, see above; None keeps all
-            faces, which takes time and memory in proportion to the volume.
+        log_odds_margin: required on both sides of a face, see above; None keeps all faces, which takes
+            time and memory in proportion to the volume.
         progress: show a progress bar.
 
     Returns:
@@ -94,7 +94,7 @@ def extract_mesh(
 
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
-    _check_meshing(model, resolution, threshold, evidence)
+    _check_meshing(model, resolution, threshold, log_odds_margin)
     colors = (*COLORS, *channel_names(model), None)
     for name, value, allowed in (("surface", surface, SURFACES), ("color", color, colors)):
         if value not in allowed:
@@ -108,7 +108,7 @@ def extract_mesh(
         threshold,
         surface=surface,
         color=color,
-        evidence=evidence,
+        log_odds_margin=log_odds_margin,
         progress=progress,
     )
 
@@ -163,7 +163,7 @@ def lattice_mesh(
     *,
     surface: str = "peak",
     color: str | None = "height",
-    evidence: float | None = EVIDENCE,
+    log_odds_margin: float | None = LOG_ODDS_MARGIN,
     progress: bool = False,
     report: Callable[[int], object] = lambda _: None,
 ) -> trimesh.Trimesh:
@@ -177,15 +177,15 @@ def lattice_mesh(
     if lattice is None:
         return trimesh.Trimesh(process=False)
     sign = _sign(threshold)
-    rule = Rule(threshold_log_odds(threshold), sign, evidence)
+    rule = Rule(threshold_log_odds(threshold), sign, log_odds_margin)
     boxes = cluster_boxes(model, sign, lattice.bounds if lattice.is_cut else None)
-    if evidence is None:
+    if log_odds_margin is None:
         starts = blocks_near_boxes(lattice, *boxes)
     else:
         starts = seed_blocks(model, lattice, rule)
         if lattice.is_cut:  # a surface that comes from outside the bounds crosses them
             starts = np.union1d(starts, border_blocks(lattice, *boxes))
-    allowed = starts if evidence is None else None
+    allowed = starts if log_odds_margin is None else None
     expected = estimate_mesh(model, lattice.resolution, lattice.bounds, sign)
     bar = {"total": expected.faces, "desc": f"mesh, {expected}", "unit": " faces"}
     with tqdm(**bar, disable=None if progress else True) as counter:
@@ -217,7 +217,7 @@ def lattice_mesh(
 
 
 def _check_meshing(
-    model: OccupancyMap, resolution: float, threshold: float, evidence: float | None
+    model: OccupancyMap, resolution: float, threshold: float, log_odds_margin: float | None
 ) -> None:
     if model.dim != 3:
         raise ValueError(
@@ -228,8 +228,10 @@ def _check_meshing(
     if not (resolution > 0 and math.isfinite(resolution)):
         raise ValueError(f"resolution must be > 0 m and finite; got {resolution}")
     threshold_log_odds(threshold)  # raises
-    if evidence is not None and not evidence >= 0:
-        raise ValueError(f"evidence must be >= 0, or None to keep all faces; got {evidence}")
+    if log_odds_margin is not None and not log_odds_margin >= 0:
+        raise ValueError(
+            f"log_odds_margin must be >= 0, or None to keep all faces; got {log_odds_margin}"
+        )
 
 
 def _sign(threshold: float) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor
 from lardhm_torch.maps import OccupancyMap, native_map
 from lardhm_torch.native import available
 from lardhm_torch.native import surfaces as native
-from lardhm_torch.queries.grids import EVIDENCE
+from lardhm_torch.queries.grids import LOG_ODDS_MARGIN
 from lardhm_torch.queries.raycasting import first_peak, parabola_vertex
 from lardhm_torch.surfaces.following import Sheet
 
@@ -49,7 +49,7 @@ def ridge_positions(model: OccupancyMap, points: Tensor, strides: Tensor) -> Ten
     """
     tensors = native_map(model)
     if tensors is not None:
-        return native.ridge_positions(tensors, points, strides, STEPS, EVIDENCE)
+        return native.ridge_positions(tensors, points, strides, STEPS, LOG_ODDS_MARGIN)
     numbers = torch.arange(STEPS + 1, device=points.device)[:, None, None]
     chunks = zip(points.split(CHUNK_VERTICES), strides.split(CHUNK_VERTICES), strict=True)
     positions = [

@@ -55,7 +55,9 @@ def figure_two(data: Path, folder: Path) -> dict[str, Any]:
         faces[name] = len(mesh.faces)
         _draw(mesh, folder / f"figure_2_{name}.png")
     room = (task.grid[0], task.grid[-1])
-    mesh = extract_mesh(lard, bounds=room, surface="crossing", color="variance", evidence=None)
+    mesh = extract_mesh(
+        lard, bounds=room, surface="crossing", color="variance", log_odds_margin=None
+    )
     _draw(mesh, folder / "figure_2_lard_hm_variance.png")
     mesh = lattice_mesh(gps, task, data)
     variance = ask(gps.variance, torch.as_tensor(np.array(mesh.vertices)))
