@@ -173,8 +173,7 @@ struct Blocks {
   }
 };
 
-// Centers by rank, ascending, and their coordinates relative to the corner of the centers' box. A
-// register of centers that do not exist follows.
+// Centers by rank, ascending, and their coordinates relative to the corner of the centers' box.
 template <int D>
 struct Candidates {
   std::vector<int32_t> rank;
@@ -191,43 +190,39 @@ struct Candidates {
   void collect(const Index& index, const Blocks<D>& blocks, const Region<D>& region,
                float radius) {
     const WideInt limit = squared_as_bits(radius * 1.0001f);
-    reserve(blocks.size * kBlock);
-    int32_t* ranks = rank.data();
-    float* to[D];
-    for (int d = 0; d < D; ++d) to[d] = at[d].data();
-    int64_t n = 0;
+    size = 0;
     for (int64_t i = 0; i < blocks.size; i += kWide)
-      for (uint32_t near = blocks.within(i, region, limit); near; near &= near - 1) {
-        const int64_t first = int64_t(blocks.block[i + __builtin_ctz(near)]) * kBlock;
-        for (int lane = 0; lane < kBlock; lane += kWide) {
-          const float* from[D];
-          for (int d = 0; d < D; ++d) from[d] = index.relative + first * D + d * kBlock + lane;
-          const uint32_t keep = centers_within(region, from, limit);
-          compress(keep, Numbers(first + lane).lane, ranks + n);
-          for (int d = 0; d < D; ++d) compress(keep, from[d], to[d] + n);
-          n += __builtin_popcount(keep);
-        }
+      for (uint32_t keep = blocks.within(i, region, limit); keep; keep &= keep - 1) {
+        reserve(size + kBlock);
+        const int64_t block = blocks.block[i + __builtin_ctz(keep)];
+        for (int lane = 0; lane < kBlock; lane += kWide)
+          add(index, block, lane, region, limit);
       }
-    while (n && ranks[n - 1] >= index.header.count) --n;  // where all are kept
-    std::fill_n(ranks + n, kWide, int32_t(index.header.count));
-    for (int d = 0; d < D; ++d) std::fill_n(to[d] + n, kWide, kFarAway);
-    size = n;
+  }
+
+  void add(const Index& index, int64_t block, int lane, const Region<D>& region, WideInt limit) {
+    const float* from[D];
+    for (int d = 0; d < D; ++d) from[d] = index.relative + (block * D + d) * kBlock + lane;
+    const int64_t first = block * kBlock + lane;
+    const uint32_t keep =
+        centers_within(region, from, limit) & existing(first, index.header.count);
+    if (!keep) return;
+    compress(keep, Numbers(first).lane, rank.data() + size);
+    for (int d = 0; d < D; ++d) compress(keep, from[d], at[d].data() + size);
+    size += __builtin_popcount(keep);
   }
 
   // Ranks of those within the radius of the region; returns how many.
   int64_t pick(const Region<D>& region, float radius, int32_t* to) const {
     const WideInt limit = squared_as_bits(radius);
-    const int32_t *ranks = rank.data(), *end = ranks + size, none = ranks[size];
-    const float* from[D];
-    for (int d = 0; d < D; ++d) from[d] = at[d].data();
     int64_t kept = 0;
-    for (; ranks < end; ranks += kWide) {
-      const uint32_t keep = centers_within(region, from, limit);
-      compress(keep, ranks, to + kept);
+    for (int64_t i = 0; i < size; i += kWide) {
+      const float* from[D];
+      for (int d = 0; d < D; ++d) from[d] = at[d].data() + i;
+      const uint32_t keep = centers_within(region, from, limit) & existing(i, size);
+      compress(keep, rank.data() + i, to + kept);
       kept += __builtin_popcount(keep);
-      for (int d = 0; d < D; ++d) from[d] += kWide;
     }
-    while (kept && to[kept - 1] == none) --kept;  // where all are kept
     return kept;
   }
 };
