@@ -20,6 +20,7 @@ from lardhm_torch.io import map_files, packed_files
 from lardhm_torch.io.atomic_files import remove_partials, replaced_file
 from lardhm_torch.learning import packing
 from lardhm_torch.learning.clustering import scan_clusters, split_labels
+from lardhm_torch.learning.points import at_most
 from lardhm_torch.learning.update import UpdateConfig
 from lardhm_torch.native.thinning import few_per_cell
 from lardhm_torch.sampling import (
@@ -27,7 +28,6 @@ from lardhm_torch.sampling import (
     Samples,
     SamplingConfig,
     sample_rays,
-    spread_rows,
 )
 from lardhm_torch.scans import Scans, seeded_generator
 
@@ -207,8 +207,7 @@ def _thinned(scan: Scans, config: StreamConfig, rng: torch.Generator) -> Scans:
     limit = config.update.max_points
     rows = few_per_cell(scan.ends, scan.is_return.long(), config.update.cell_edge)
     is_return = scan.is_return[rows]
-    parts = [rows[is_return], rows[~is_return]]
-    parts = [p[spread_rows(len(p), limit, rng)] if len(p) > limit else p for p in parts]
+    parts = [at_most(rows[kind], limit, rng) for kind in (is_return, ~is_return)]
     return scan.select(torch.cat(parts).sort().values)
 
 

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from command_runs import fails, run
 from room_scan import POSITION, sensor_points, with_zeros, world_points
 from scan_files import pcd_header
 
@@ -24,19 +25,6 @@ from lardhm_torch.cli.scan_files import iter_pieces_of
 from lardhm_torch.io.notes import Note
 from lardhm_torch.io.scan_files import Reading, iter_pieces
 from lardhm_torch.scans import every_scan, thin_rays
-
-
-def run(*words):
-    assert main([str(word) for word in words]) == 0
-
-
-def fails(capsys, *words):
-    """The one line that a verb prints when it fails."""
-    capsys.readouterr()
-    assert main([str(word) for word in words]) == 1
-    out, err = capsys.readouterr()
-    assert (out, len(err.splitlines())) == ("", 1)
-    return err
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_runs import run
 from small_maps import same_map, wall
 
 from lardhm_torch import (
@@ -187,10 +188,6 @@ def test_settings_are_checked_when_made(name):
 
 
 # --- the command line and the script ---
-
-
-def run(*words):
-    assert main([str(word) for word in words]) == 0
 
 
 def test_fit_incremental_and_its_resume_are_the_stream(folder, whole, tmp_path, capsys):

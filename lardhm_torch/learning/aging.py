@@ -11,6 +11,7 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import feature_sums
+from lardhm_torch.learning.clustering import split_labels
 from lardhm_torch.learning.map_merging import with_limits
 from lardhm_torch.learning.map_state import NEVER, MapState
 from lardhm_torch.learning.parameters import AnyMap, MapParameters, read_state, write_rows
@@ -46,8 +47,7 @@ def timed(
         return part
     index = native.build_index(part.centers, kernel.num_neighbors)
     seen = torch.zeros_like(part.is_occupied)
-    for kind, label in enumerate((1.0, 0.0, 0.5)):
-        own = points[labels == label]
+    for kind, own in enumerate(split_labels(points, labels)):
         if len(own):
             wanted = part.kinds == kind
             sums = feature_sums(own, part.centers, part.raw_scale_tril, wanted, kernel, index)

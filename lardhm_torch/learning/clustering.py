@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.learning.points import count_cells, morton_order
+from lardhm_torch.learning.points import at_most, count_cells, morton_order
 from lardhm_torch.native import nearest_centers
 from lardhm_torch.sampling import spread_rows
 
@@ -316,7 +316,7 @@ def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -
     The inertia is smallest for a density of centers between that of the points and a uniform one.
     """
     count = START_POINTS * num_clusters
-    ordered = points[spread_rows(len(points), count, rng)] if len(points) > count else points
+    ordered = at_most(points, count, rng)
     if num_clusters >= len(ordered):
         return ordered
     lag = max(1, len(ordered) // (4 * num_clusters))

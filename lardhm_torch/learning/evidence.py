@@ -22,8 +22,8 @@ from lardhm_torch.learning.clustering import (
     split_labels,
 )
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
+from lardhm_torch.learning.points import at_most
 from lardhm_torch.native.thinning import BITS, priorities
-from lardhm_torch.sampling import spread_rows
 
 SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
 
@@ -237,8 +237,7 @@ def fitted_evidence(
         if len(rows) == 0:
             continue
         count = SAMPLE_FACTOR * EVIDENCE * len(rows)
-        if len(members) > count:
-            members = members[spread_rows(len(members), count, rng)]
+        members = at_most(members, count, rng)
         owners = native.nearest_centers(members, state.means[rows], 1).squeeze(1)
         evidence[rows] = keep_points(members, owners, len(rows))
     return evidence

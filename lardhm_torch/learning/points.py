@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.maps import TensorLike, to_tensor
-from lardhm_torch.sampling import UNKNOWN
+from lardhm_torch.sampling import UNKNOWN, spread_rows
 
 CHECK_CHUNK = 1 << 18  # number of labels checked at a time, to limit memory
 OUTLIER_FACTOR = (
@@ -171,6 +171,11 @@ def in_morton_order(points: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
     """
     order = morton_order(points)
     return tuple(column.index_select(0, order) for column in (points, *columns))
+
+
+def at_most(rows: Tensor, limit: int, rng: torch.Generator) -> Tensor:
+    """(N, ...) rows, or a stratified random subset of ``limit`` of them."""
+    return rows[spread_rows(len(rows), limit, rng)] if len(rows) > limit else rows
 
 
 def blurred_hits(points: Tensor, labels: Tensor, noise: float, rng: torch.Generator) -> Tensor:

@@ -29,11 +29,11 @@ from lardhm_torch.learning.evidence import kept_counts, kept_points, with_eviden
 from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.forgetting import doubted, forget
 from lardhm_torch.learning.map_state import MapState
-from lardhm_torch.learning.points import in_morton_order
+from lardhm_torch.learning.points import at_most, in_morton_order
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
 from lardhm_torch.native.thinning import few_per_cell
-from lardhm_torch.sampling import UNKNOWN, spread_rows
+from lardhm_torch.sampling import UNKNOWN
 
 MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
 UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown
@@ -143,14 +143,10 @@ def _thinned(
     The samples of a scan are dense near the sensor and on close surfaces; the map is as accurate without
     most of those.
     """
-    rows, limit = [], config.max_points
-    for label in (1.0, 0.0, UNKNOWN):
-        own = (labels == label).nonzero().squeeze(1)
-        own = own[
-            few_per_cell(points.index_select(0, own), torch.zeros_like(own), config.cell_edge)
-        ]
-        rows.append(own[spread_rows(len(own), limit, rng)] if len(own) > limit else own)
-    chosen = torch.cat(rows)
+    few = few_per_cell(points, (2 * labels).long(), config.cell_edge)
+    of_few = labels[few]
+    rows = [few[of_few == label] for label in (1.0, 0.0, UNKNOWN)]
+    chosen = torch.cat([at_most(own, config.max_points, rng) for own in rows])
     return points.index_select(0, chosen), labels.index_select(0, chosen)
 
 

@@ -276,54 +276,6 @@ Tensors<2> halves(const Tensor& given) {
   return result;
 }
 
-// A set of 64-bit keys: a table with a free entry for every key that it may get.
-class Keys {
-  std::vector<uint64_t> table;
-  std::vector<char> used;
-  uint64_t last;
-
- public:
-  int64_t size = 0;
-
-  explicit Keys(int64_t most) {
-    uint64_t room = 16;
-    while (room < 2 * uint64_t(most)) room *= 2;
-    table.resize(room), used.resize(room);
-    last = room - 1;
-  }
-
-  void insert(uint64_t key) {
-    uint64_t at = (key * 0x9E3779B97F4A7C15ull) >> 20 & last;
-    while (used[at] && table[at] != key) at = (at + 1) & last;
-    size += !used[at];
-    used[at] = 1, table[at] = key;
-  }
-};
-
-// Number of cells of a lattice that hold points.
-int64_t count_cells(const Tensor& given_points, double edge) {
-  const Tensor points = tidy(given_points);
-  check(edge > 0, "edge must be > 0");
-  int64_t count = 0;
-  dispatch(points, [&](auto type, auto dim) {
-    using T = decltype(type);
-    constexpr int D = dim();
-    const int64_t n = points.size(0);
-    Keys cells(n);
-    uint64_t before = 0;
-    for (int64_t i = 0; i < n; ++i) {
-      uint64_t key = 0;
-      for (int d = D - 1; d >= 0; --d)
-        key = (key << 21) + uint64_t(int64_t(std::floor(in<T>(points)[i * D + d] / T(edge))));
-      if (i && key == before) continue;
-      cells.insert(before = key);
-    }
-    count = cells.size;
-    return 0;
-  });
-  return count;
-}
-
 }  // namespace
 
 std::vector<Operator> kept_operators() {
@@ -336,7 +288,6 @@ std::vector<Operator> kept_operators() {
       {"follow_kept(Tensor evidence, Tensor counts, Tensor centers, Tensor means, Tensor scatters, "
        "Tensor raw_scale_tril, Tensor known, float floor) -> (Tensor, Tensor, Tensor, Tensor)",
        &boxed<follow_kept>},
-      {"count_cells(Tensor points, float edge) -> int", &boxed<count_cells>},
   };
 }
 

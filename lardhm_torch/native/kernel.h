@@ -10,11 +10,11 @@ namespace lardhm {
 
 constexpr double kFading = 0.5;  // as features.FADING
 
-// Whitened offset inv(L) offset.
-template <class T, int D>
-LARDHM_INLINE void whiten_offset(const typename Simd<T>::V* offset, const T* shape,
+// Whitened offset inv(L) offset; the shape is that of one cluster, or one for each lane.
+template <class T, int D, class Shape>
+LARDHM_INLINE void whiten_offset(const typename Simd<T>::V* offset, const Shape* shape,
                                  typename Simd<T>::V* z) {
-  const T* below = shape + Layout<D>::below;
+  const Shape* below = shape + Layout<D>::below;
   z[0] = offset[0] * shape[0];
   z[1] = (offset[1] - z[0] * below[0]) * shape[1];
   if constexpr (D == 3) z[2] = (offset[2] - z[0] * below[1] - z[1] * below[2]) * shape[2];

@@ -121,20 +121,13 @@ struct Lanes {
       for (int d = 0; d < D; ++d) offset[d] = x[d] - fields[d * rows + r];
       for (int f = D; f < Record<D>::fields; ++f) shape[f - D] = fields[f * rows + r];
       for (int d = 0; d < D; ++d) sum += offset[d] * offset[d];
-      whiten(offset, shape, zr);
+      whiten_offset<T, D>(offset, shape, zr);
       squared[r] = sum * exists[r];
       for (int d = 0; d < D; ++d) z[d * rows + r] = zr[d];
       kernel[r] = kernel_of<T, D>(zr) * exists[r];
       most = squared[r] > most ? squared[r] : most;
     }
     return -smallest_lane<T>(-most);
-  }
-
-  static void whiten(const V* offset, const V* shape, V* zr) {
-    const V* below = shape + D;
-    zr[0] = offset[0] * shape[0];
-    zr[1] = (offset[1] - zr[0] * below[0]) * shape[1];
-    if constexpr (D == 3) zr[2] = (offset[2] - zr[0] * below[1] - zr[1] * below[2]) * shape[2];
   }
 
   T log_odds(T fading, bool fades) const {

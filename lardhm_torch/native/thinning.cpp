@@ -1,4 +1,4 @@
-// A few points of each cell of a lattice, see `thinning.few_per_cell`.
+// Cells of a lattice that hold points: a few points of each (`thinning.few_per_cell`), and their number.
 
 #include <algorithm>
 #include <cmath>
@@ -51,7 +51,7 @@ class Numbers {
   }
 
   int32_t of(uint64_t cell) {
-    uint64_t at = cell & last;
+    uint64_t at = (cell * 0x9E3779B97F4A7C15ull) >> 20 & last;
     while (table[at].number >= 0 && table[at].cell != cell) at = (at + 1) & last;
     if (table[at].number < 0) table[at] = {cell, count++};
     return table[at].number;
@@ -110,10 +110,35 @@ Tensor few_per_cell(const Tensor& given_points, const Tensor& given_groups, doub
   return rows;
 }
 
+// Number of cells of a lattice that hold points.
+int64_t count_cells(const Tensor& given_points, double edge) {
+  const Tensor points = tidy(given_points);
+  check(edge > 0, "edge must be > 0");
+  int64_t count = 0;
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const int64_t n = points.size(0);
+    Numbers cells(n);
+    uint64_t before = 0;
+    for (int64_t i = 0; i < n; ++i) {
+      uint64_t key = 0;
+      for (int d = D - 1; d >= 0; --d)
+        key = (key << 21) + uint64_t(int64_t(std::floor(in<T>(points)[i * D + d] / T(edge))));
+      if (i && key == before) continue;
+      cells.of(before = key);
+    }
+    count = cells.count;
+    return 0;
+  });
+  return count;
+}
+
 }  // namespace
 
 std::vector<Operator> thinning_operators() {
   return {
+      {"count_cells(Tensor points, float edge) -> int", &boxed<count_cells>},
       {"few_per_cell(Tensor points, Tensor groups, float edge, int most) -> Tensor",
        &boxed<few_per_cell>},
   };
