@@ -113,20 +113,32 @@ def kept_points(evidence: Tensor, rows: Tensor | None = None) -> tuple[Tensor, T
     return found[mask], rows[mask.nonzero()[:, 0]]
 
 
-def kept_again(points: Tensor, owners: Tensor, evidence: Tensor) -> Tensor:
-    """(M,) number of the points of each cluster that it keeps already.
+def kept_again(
+    points: Tensor, owners: Tensor, evidence: Tensor, cleared: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Which points clusters keep already, and which they can keep.
 
     Args:
         points: (N, D) positions [m].
-        owners: (N,) their clusters; points with any other number are left out.
-        evidence: (M, E, D).
+        owners: (N,) their clusters; points with a negative number are left out.
+        evidence: (K, E, D) of the first of M clusters.
+        cleared: (M,) bool, clusters that lose the points that they keep.
+
+    Returns:
+        (M,) number of the points that a cluster keeps already; (N,) bool: False for those, and for
+        points with larger priorities than all points of a cluster that keeps E and loses none.
     """
     if _is_native(evidence):
-        return torch.ops.lardhm.kept_again(points, owners, evidence)
-    inside = (owners >= 0) & (owners < len(evidence))
-    points, owners = points[inside], owners[inside]
-    again = (evidence[owners] == points[:, None]).all(dim=2).any(dim=1)
-    return torch.bincount(owners[again], minlength=len(evidence))
+        return torch.ops.lardhm.kept_again(points, owners, evidence, cleared)
+    enters = owners >= 0
+    rows = (enters & (owners < len(evidence))).nonzero().squeeze(1)
+    points, owners = points[rows], owners[rows]
+    kept = evidence[owners]
+    again = (kept == points[:, None]).all(dim=2).any(dim=1)
+    last = priorities(evidence.flatten(0, 1)).reshape(evidence.shape[:2]).amax(dim=1)[owners]
+    loses = kept[:, -1, 0].isinf() | cleared[owners]
+    enters[rows] = ~again & (loses | (priorities(points) <= last))
+    return torch.bincount(owners[again], minlength=len(cleared)), enters
 
 
 def _is_native(evidence: Tensor) -> bool:

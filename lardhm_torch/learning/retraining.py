@@ -23,7 +23,7 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.sampling import UNKNOWN
 
-FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
+FRESH = 1 / 4  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 256  # clusters that are chosen for training together
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
@@ -58,11 +58,12 @@ def retrained(
     points, owners = kept_points(state.evidence, rows)
     sizes = torch.bincount(owners, minlength=len(state))
     factors = balanced(state.kinds, evidence_weights(state), config, sizes) * trust(state.doubts)
-    labels, factors = KIND_LABELS.to(points)[state.kinds][owners], factors[owners]
+    labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
+    factors = factors.index_select(0, owners)
     config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
     weights, (rows, losses) = trained(state, index, (points, labels, factors), task)
-    owners = owners[rows]
+    owners = owners.index_select(0, rows)
     found = torch.bincount(owners, minlength=len(state))
     losses = torch.zeros_like(weights).index_add_(0, owners, losses) / found
     return replace(
@@ -106,27 +107,30 @@ def trained(
     features = ordered_features(
         points, batched, state.centers, state.raw_scale_tril, task.kernel, index
     )
-    targets = labels[batched]
+    targets = labels.index_select(0, batched)
     weights = fit_weights(
         lambda rows: (features[0][rows], features[1][rows]),
-        targets, state.weights, config, factors=factors[batched],
+        targets, state.weights, config, factors=factors.index_select(0, batched),
     )  # fmt: skip
-    rows = slice(None, None, LOSS_STRIDE)
-    losses = excess_losses(features[0][rows], features[1][rows], targets[rows], weights)
-    return weights, (batched[rows], losses)
+    losses = excess_losses(*features, targets, weights, LOSS_STRIDE)
+    return weights, (batched[::LOSS_STRIDE], losses)
 
 
-def excess_losses(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
-    """(N,) loss of each sample, in excess of that of a perfect prediction.
+def excess_losses(
+    indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor, stride: int = 1
+) -> Tensor:
+    """Loss of every ``stride``-th of N samples, in excess of that of a perfect prediction.
 
     Args:
         indices: (N, K) clusters.
         values: (N, K) kernel values.
         labels: (N,) in [0, 1].
         weights: (M,).
+        stride: 1 for all samples.
     """
     if native.descends(indices, values):
-        return torch.ops.lardhm.excess_losses(indices, values, labels, weights)
+        return torch.ops.lardhm.excess_losses(indices, values, labels, weights, stride)
+    indices, values, labels = (tensor[::stride] for tensor in (indices, values, labels))
     log_odds = (values * weights[indices]).sum(dim=1)
     loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, labels, reduction="none")
     return loss + torch.xlogy(labels, labels) + torch.xlogy(1 - labels, 1 - labels)

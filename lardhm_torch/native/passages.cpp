@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "eigen.h"
 #include "tensors.h"
 #include "threads.h"
 
@@ -74,6 +75,66 @@ Tensor balanced_order(const Tensor& given, int64_t levels) {
   else
     divide<3>(doubles(points), count, levels, out<int64_t>(order));
   return order;
+}
+
+// Moments and axes of a leaf's points, see `crossings.find_patches`.
+template <int D>
+struct Leaf {
+  double mean[D] = {}, covariance[D * D] = {};
+
+  Leaf(const double* points, const int64_t* rows, int64_t count, double floor) {
+    for (int64_t i = 0; i < count; ++i)
+      for (int d = 0; d < D; ++d) mean[d] += points[rows[i] * D + d];
+    for (int d = 0; d < D; ++d) mean[d] /= double(count);
+    for (int64_t i = 0; i < count; ++i)
+      for (int a = 0; a < D; ++a)
+        for (int b = 0; b < D; ++b)
+          covariance[a * D + b] +=
+              (points[rows[i] * D + a] - mean[a]) * (points[rows[i] * D + b] - mean[b]);
+    for (double& entry : covariance) entry /= double(std::max<int64_t>(1, count - 1));
+    for (int d = 0; d < D; ++d) covariance[d * D + d] += floor * floor;
+  }
+};
+
+template <int D>
+void write_leaves(const double* points, const int64_t* order, int64_t count, int64_t levels,
+                  double floor, const Tensors<4>& to) {
+  const int64_t leaves = int64_t(1) << levels;
+  constexpr int64_t kGrain = 64;
+  run_tasks((leaves + kGrain - 1) / kGrain, [&](int64_t task) {
+    for (int64_t i = task * kGrain; i < std::min(leaves, (task + 1) * kGrain); ++i) {
+      const int64_t first = i * count >> levels, stop = (i + 1) * count >> levels;
+      const Leaf<D> leaf(points, order + first, stop - first, floor);
+      const Eigen<D> axes(leaf.covariance);
+      std::copy_n(leaf.mean, D, out<double>(to[0]) + i * D);
+      std::copy_n(leaf.covariance, D * D, out<double>(to[1]) + i * D * D);
+      for (int d = 0; d < D; ++d) {
+        out<double>(to[2])[i * D + d] = std::max(axes.values[d], floor * floor);
+        for (int j = 0; j < D; ++j) out<double>(to[3])[(i * D + d) * D + j] = axes.vectors[d][j];
+      }
+    }
+  });
+}
+
+Tensors<4> leaf_moments(const Tensor& given, const Tensor& given_order, int64_t levels,
+                        double floor) {
+  const Tensor points = tidy(given), order = tidy(given_order);
+  const int64_t count = points.size(0), dim = points.size(1);
+  check(points.dim() == 2 && (dim == 2 || dim == 3) &&
+            points.scalar_type() == ScalarType::Double && order.numel() == count &&
+            order.scalar_type() == ScalarType::Long,
+        "points must be (N, 2) or (N, 3), float64, and order (N,) int64");
+  check(levels >= 0 && levels < 40 && count >> levels > 0, "a leaf must hold points");
+  for (int64_t i = 0; i < count; ++i)
+    check(in<int64_t>(order)[i] >= 0 && in<int64_t>(order)[i] < count, "order must hold rows");
+  const int64_t leaves = int64_t(1) << levels;
+  const Tensors<4> result{new_empty(points, {leaves, dim}), new_empty(points, {leaves, dim, dim}),
+                          new_empty(points, {leaves, dim}), new_empty(points, {leaves, dim, dim})};
+  if (dim == 2)
+    write_leaves<2>(doubles(points), in<int64_t>(order), count, levels, floor, result);
+  else
+    write_leaves<3>(doubles(points), in<int64_t>(order), count, levels, floor, result);
+  return result;
 }
 
 template <int D>
@@ -250,6 +311,9 @@ namespace lardhm {
 std::vector<Operator> passages_operators() {
   return {
       {"balanced_order(Tensor points, int levels) -> Tensor", &boxed<passages::balanced_order>},
+      {"leaf_moments(Tensor points, Tensor order, int levels, float floor) -> (Tensor, Tensor, "
+       "Tensor, Tensor)",
+       &boxed<passages::leaf_moments>},
       {"passing(Tensor starts, Tensor ahead, Tensor reach, Tensor ends, Tensor low, Tensor high, "
        "Tensor means, Tensor precisions, Tensor normals, Tensor clear, float limit) -> (Tensor, "
        "Tensor)",
