@@ -26,6 +26,7 @@ from lardhm_torch.sampling import UNKNOWN
 FRESH = 1 / 4  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 256  # clusters that are chosen for training together
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
+BESIDE = 8  # clusters with fixed weights constrain others with so many of their points
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
 
@@ -37,8 +38,8 @@ def retrained(
 
     A cluster has changed if more than `FRESH` of its kept points are new.
 
-    The evidence of the neighbors of those constrains them, too. ``losses`` of all clusters whose
-    evidence was used are updated.
+    Some of the evidence of the neighbors of those constrains them, too. ``losses`` of the trained
+    clusters are updated.
 
     Args:
         state: M clusters.
@@ -55,9 +56,12 @@ def retrained(
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
-    points, owners = kept_points(state.evidence, rows)
+    kept = kept_counts(state.evidence)
+    used = torch.where(moving, kept, kept.clamp(max=BESIDE))
+    points, owners = kept_points(state.evidence, rows, used)
     sizes = torch.bincount(owners, minlength=len(state))
-    factors = balanced(state.kinds, evidence_weights(state), config, sizes) * trust(state.doubts)
+    strength = evidence_weights(state) * (kept / used.clamp(min=1))
+    factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
     factors = factors.index_select(0, owners)
     config = _with_enough_steps(config, len(points))
@@ -69,7 +73,7 @@ def retrained(
     return replace(
         state,
         weights=torch.where(moving, weights, state.weights),
-        losses=torch.where(found > 0, losses, state.losses),
+        losses=torch.where(moving & (found > 0), losses, state.losses),
         fresh=state.fresh.masked_fill(moving, 0),
     )
 

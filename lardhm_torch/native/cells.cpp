@@ -16,8 +16,6 @@ namespace {
 
 constexpr int kTableBits = 24;                                  // as crossings.TABLE_BITS
 constexpr int kGlanceBits = 22;                                 // 512 KB
-constexpr int kBlockBits = 17;                                  // 16 KB
-constexpr int kBlockShift = kWide == 4 ? 3 : kWide == 8 ? 4 : 5;  // a block is 2 kWide cells wide
 constexpr uint32_t kPrimes[3] = {73856093, 19349669, 83492791};  // as crossings.PRIMES
 constexpr int64_t kRaysPerTask = 256, kPointsPerTask = 8192;
 
@@ -39,6 +37,21 @@ class Bits {
   }
 };
 
+// Rays mark only entries that belong to some point. These are few: most steps along a ray end after a
+// look at a small table, which is not written while rays are followed.
+struct Table {
+  Bits glance{kGlanceBits}, asked{kTableBits}, crossed{kTableBits};
+
+  void ask(uint32_t entry) {
+    glance.mark(entry);
+    asked.mark(entry);
+  }
+
+  void cross(uint32_t entry) {
+    if (asked.has(entry)) crossed.mark(entry);
+  }
+};
+
 constexpr uint32_t kEntries = (uint32_t(1) << kTableBits) - 1;
 
 // Table entry of a cell. Only the low bits matter, so cell indices may wrap around.
@@ -49,34 +62,6 @@ uint32_t entry_of(const int64_t* cell) {
   return entry & kEntries;
 }
 
-// Rays mark only entries that belong to some point. These are few: most steps along a ray end after a
-// look at a small table, of single cells or of blocks of them, which is not written while rays are
-// followed.
-struct Table {
-  Bits blocks{kBlockBits}, glance{kGlanceBits}, asked{kTableBits}, crossed{kTableBits};
-
-  // Also marks the blocks in which the middle of kWide steps along a ray lies if one is in the cell.
-  template <int D>
-  void ask(const int64_t* cell) {
-    const uint32_t entry = entry_of<D>(cell);
-    if (asked.has(entry)) return;
-    glance.mark(entry);
-    asked.mark(entry);
-    for (int corner = 0; corner < 1 << D; ++corner) {
-      uint32_t block = 0;
-      for (int d = 0; d < D; ++d) {
-        const int32_t at = int32_t(uint32_t(cell[d]) + (corner >> d & 1 ? kWide / 2 : -kWide / 2));
-        block ^= uint32_t(at >> kBlockShift) * kPrimes[d];
-      }
-      blocks.mark(block);
-    }
-  }
-
-  void cross(uint32_t entry) {
-    if (asked.has(entry)) crossed.mark(entry);
-  }
-};
-
 using Unsigned = uint32_t __attribute__((vector_size(kRegisterBytes)));
 
 inline Unsigned whole_cells(Wide x) {
@@ -84,48 +69,28 @@ inline Unsigned whole_cells(Wide x) {
   return (Unsigned)(toward_zero + (__builtin_convertvector(toward_zero, Wide) > x));
 }
 
-// A ray from its start: a cell and the place inside it.
+// Marks the cells at half a cell, one and a half, ... along a ray from its start: a cell and the
+// place inside it.
 template <int D>
-struct Way {
-  const int64_t* cell;
-  const float *inside, *way;
-
-  // Numbers of the cells so far along the ray, in units of a cell.
-  void cells(Wide along, Unsigned* found) const {
-    for (int d = 0; d < D; ++d)
-      found[d] = whole_cells(inside[d] + rounded(along * way[d])) + uint32_t(cell[d]);
-  }
-};
-
-// The lanes of `some` whose entries have a bit.
-inline uint32_t marked(const Bits& bits, Unsigned entry, uint32_t some) {
-  uint32_t entries[kWide], found = 0;
-  std::memcpy(entries, &entry, sizeof(entries));
-  for (int j = 0; j < kWide; ++j) found |= uint32_t(bits.has(entries[j])) << j;
-  return found & some;
-}
-
-// Marks the cells at half a cell, one and a half, ... along a ray.
-template <int D>
-void march(const Way<D>& ray, int64_t steps, Table& table) {
+void march(const int64_t* cell, const float* inside, const float* way, int64_t steps,
+           Table& table) {
   Wide lane;
-  for (int j = 0; j < kWide; ++j) lane[j] = float(j);
-  Unsigned cells[D];
-  for (int64_t first = 0; first < steps; first += kWide * kWide) {
-    ray.cells(float(first) + (lane + 0.5f) * float(kWide), cells);  // middles of kWide steps each
-    Unsigned block = {};
-    for (int d = 0; d < D; ++d)
-      block ^= (Unsigned)((WideInt)cells[d] >> kBlockShift) * kPrimes[d];
-    uint32_t runs = existing(0, (steps - first + kWide - 1) / kWide);
-    for (runs = marked(table.blocks, block, runs); runs; runs &= runs - 1) {
-      const int64_t step = first + kWide * __builtin_ctz(runs);
-      ray.cells(float(step) + (lane + 0.5f), cells);
-      Unsigned entry = {};
-      for (int d = 0; d < D; ++d) entry ^= cells[d] * kPrimes[d];
-      entry &= kEntries;
-      uint32_t some = marked(table.glance, entry, existing(0, steps - step));
-      for (; some; some &= some - 1) table.cross(entry[__builtin_ctz(some)]);
+  for (int j = 0; j < kWide; ++j) lane[j] = float(j) + 0.5f;
+  for (int64_t step = 0; step < steps; step += kWide) {
+    const Wide along = float(step) + lane;
+    Unsigned entry = {};
+    for (int d = 0; d < D; ++d) {
+      const Wide at = inside[d] + rounded(along * way[d]);
+      entry ^= (whole_cells(at) + uint32_t(cell[d])) * kPrimes[d];
     }
+    entry &= kEntries;
+    uint32_t entries[kWide];
+    std::memcpy(entries, &entry, sizeof(entries));
+    const int64_t count = steps - step;
+    uint32_t some = 0;
+    for (int j = 0; j < kWide; ++j) some |= uint32_t(table.glance.has(entries[j])) << j;
+    for (some &= existing(0, count); some; some &= some - 1)
+      table.cross(entries[__builtin_ctz(some)]);
   }
 }
 
@@ -142,8 +107,8 @@ void march_all(const Rays& rays, Table& table) {
     const int64_t stop = std::min(rays.count, (task + 1) * kRaysPerTask);
     for (int64_t ray = task * kRaysPerTask; ray < stop; ++ray) {
       const int64_t start = rays.one_start ? 0 : ray * D;
-      const Way<D> way{rays.cells + start, rays.inside + start, rays.ways + ray * D};
-      march<D>(way, rays.steps[ray], table);
+      march<D>(rays.cells + start, rays.inside + start, rays.ways + ray * D, rays.steps[ray],
+               table);
     }
   });
 }
@@ -186,7 +151,7 @@ Tensor unmarked_cells(const Tensor& given_points, const Tensor& given_cells,
   Table table;
   const auto run = [&](auto dim) {
     for (int64_t row = 0; row < points.size(0); ++row)
-      table.ask<dim()>(in<int64_t>(points) + row * dim());
+      table.ask(entry_of<dim()>(in<int64_t>(points) + row * dim()));
     march_all<dim()>(rays, table);
     look_up<dim()>(in<int64_t>(points), points.size(0), table, out<bool>(unmarked));
   };
