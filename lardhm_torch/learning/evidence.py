@@ -87,6 +87,11 @@ def add_points(
     return after, (~again & ~after[:, :, 0].isinf()).sum(dim=1)
 
 
+def keeps_points(evidence: Tensor) -> Tensor:
+    """(M, E, D) evidence -> (M,) bool, whether a cluster keeps any point."""
+    return ~evidence[:, 0, 0].isinf()
+
+
 def kept_counts(evidence: Tensor) -> Tensor:
     """(M, E, D) evidence -> (M,) number of kept points."""
     if _is_native(evidence):
@@ -264,7 +269,7 @@ def with_evidence(state: MapState, floor: float, rng: torch.Generator) -> Tensor
     Clusters have no evidence if the map was saved without it. Points are then drawn uniformly from
     ellipsoids with the means and covariances of the clusters.
     """
-    empty = (kept_counts(state.evidence) == 0).nonzero().squeeze(1)
+    empty = (~keeps_points(state.evidence)).nonzero().squeeze(1)
     if len(empty) == 0:
         return state.evidence
     lost = state.rows(empty)

@@ -39,7 +39,7 @@ from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
-MANY = 2.0  # new points relative to the kept ones, above which a cluster's points are regrouped
+MANY = 1.0  # new points relative to the kept ones, above which a cluster's points are regrouped
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 

@@ -48,7 +48,8 @@ def retrained(
         config: passes, rates and regularizer.
         rng: random generator.
     """
-    changed = _stalest(state, limit)
+    kept = kept_counts(state.evidence)
+    changed = _stalest(state, kept, limit)
     if not bool(changed.any()):
         return state
     index = native.build_index(state.centers, kernel.num_neighbors)
@@ -56,11 +57,10 @@ def retrained(
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
-    kept = kept_counts(state.evidence)
     used = torch.where(moving, kept, kept.clamp(max=BESIDE))
     points, owners = kept_points(state.evidence, rows, used)
     sizes = torch.bincount(owners, minlength=len(state))
-    strength = evidence_weights(state) * (kept / used.clamp(min=1))
+    strength = evidence_weights(state, kept) * (kept / used.clamp(min=1))
     factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
     factors = factors.index_select(0, owners)
@@ -140,13 +140,18 @@ def excess_losses(
     return loss + torch.xlogy(labels, labels) + torch.xlogy(1 - labels, 1 - labels)
 
 
-def _stalest(state: MapState, limit: int) -> Tensor:
+def _stalest(state: MapState, kept: Tensor, limit: int) -> Tensor:
     """(M,) mask of the clusters with the largest fractions of new points, at most ``limit``.
 
     They are chosen in blocks of clusters that are close to each other, because the neighbors of the
     chosen ones are needed, too.
+
+    Args:
+        state: M clusters.
+        kept: (M,) number of their kept points.
+        limit: maximum number.
     """
-    share = state.fresh / kept_counts(state.evidence)
+    share = state.fresh / kept
     changed = share > FRESH
     if int(changed.sum()) <= limit:
         return changed
@@ -166,13 +171,13 @@ def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor)
     return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
 
 
-def evidence_weights(state: MapState) -> Tensor:
+def evidence_weights(state: MapState, kept: Tensor) -> Tensor:
     """(M,) weight of each kept point of a cluster.
 
     A kept point represents count / kept points. Its weight is the square root of that, between one
     weight for each point that was seen and one for each point that is kept.
     """
-    represented = state.counts / kept_counts(state.evidence).clamp(min=1)
+    represented = state.counts / kept.clamp(min=1)
     return represented.clamp(min=1).sqrt().to(state.weights)
 
 
