@@ -108,7 +108,7 @@ def find_patches(hits: Tensor) -> Patches:
     scatters.index_add_(0, owners, offsets[:, :, None] * offsets[:, None])
     covariances = scatters / (sizes - 1).clamp(min=1)[:, None, None]
     covariances += FLOOR**2 * torch.eye(dim, dtype=hits.dtype, device=hits.device)
-    variances, axes = torch.linalg.eigh(covariances)
+    variances, axes = native.symmetric_axes(covariances)
     variances = variances.clamp(min=FLOOR**2)
     spread = variances.sqrt()
     precisions = (axes / variances[:, None]) @ axes.mT

@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "clusters.h"
+#include "jacobi.h"
 
 namespace lardhm {
 namespace {
@@ -212,40 +213,16 @@ Tensors<4> follow_kept(
   return {centers, means, scatters, raw};
 }
 
-// Direction of the largest eigenvalue of a symmetric matrix, by Jacobi's method; its largest component
-// is positive.
+// Direction of the largest eigenvalue of a symmetric matrix; its largest component is positive.
 template <int D>
 void longest_axis(const double* matrix, double* axis) {
-  constexpr int kSweeps = 12;
-  double a[D][D], v[D][D] = {};
-  for (int i = 0; i < D; ++i) {
-    v[i][i] = 1;
-    for (int j = 0; j < D; ++j) a[i][j] = matrix[i * D + j];
-  }
-  for (int sweep = 0; sweep < kSweeps; ++sweep)
-    for (int p = 0; p < D; ++p)
-      for (int q = p + 1; q < D; ++q) {
-        if (a[p][q] == 0) continue;
-        const double half = (a[q][q] - a[p][p]) / (2 * a[p][q]);
-        const double t = std::copysign(1 / (std::abs(half) + std::sqrt(half * half + 1)), half);
-        const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-        for (int i = 0; i < D; ++i) {
-          const double x = a[i][p], y = a[i][q];
-          a[i][p] = c * x - s * y, a[i][q] = s * x + c * y;
-        }
-        for (int i = 0; i < D; ++i) {
-          const double x = a[p][i], y = a[q][i];
-          a[p][i] = c * x - s * y, a[q][i] = s * x + c * y;
-          const double z = v[i][p], w = v[i][q];
-          v[i][p] = c * z - s * w, v[i][q] = s * z + c * w;
-        }
-      }
-  int longest = 0, largest = 0;
+  double values[D], axes[D][D];
+  jacobi<D>(matrix, values, axes);
+  int largest = 0;
   for (int i = 1; i < D; ++i)
-    if (a[i][i] > a[longest][longest]) longest = i;
-  for (int i = 1; i < D; ++i)
-    if (std::abs(v[i][longest]) > std::abs(v[largest][longest])) largest = i;
-  for (int i = 0; i < D; ++i) axis[i] = v[largest][longest] < 0 ? -v[i][longest] : v[i][longest];
+    if (std::abs(axes[i][D - 1]) > std::abs(axes[largest][D - 1])) largest = i;
+  const double sign = axes[largest][D - 1] < 0 ? -1 : 1;
+  for (int i = 0; i < D; ++i) axis[i] = sign * axes[i][D - 1];
 }
 
 // The kept points of each cluster, divided at their mean along the longest axis.
