@@ -24,6 +24,7 @@ BATCH_BLOCKS = 1024  # examined at a time
 REGION_EDGE = 10.0  # [m] within which the surface is followed before other tiles are loaded
 PROBES = (1.0, 2.0, 3.0)  # standard deviations in front of and behind a vertex, where it is tested
 FREE_FACTOR = 2.0  # on the margin in front, where free space can leak through walls
+LEAST_SHARE = 0.01  # of a lattice edge between its end and a vertex of a closed surface
 SEED_RADII = torch.linspace(0, 4.5, 10)  # standard deviations from a center
 SEED_CLUSTERS = 1 << 12  # whose lines are evaluated at a time
 
@@ -35,11 +36,13 @@ class Rule(NamedTuple):
         level: log-odds of the surface.
         sign: of the weights of the supporting clusters.
         log_odds_margin: required beyond the level on both sides of a face; None: none.
+        is_closed: whether the border of the lattice is above the level, so that the surface ends nowhere.
     """
 
     level: float
     sign: int
     log_odds_margin: float | None
+    is_closed: bool = False
 
     @property
     def lowest(self) -> float:
@@ -54,7 +57,8 @@ class Rule(NamedTuple):
 
 class Sheet(NamedTuple):
     """A surface: vertices (V, 3) and faces (F, 3), and for each vertex its unit normal (V, 3), against
-    the gradient of the log-odds, and the thickness of the nearest supporting cluster (V,).
+    the gradient of the log-odds, and the thickness of the nearest supporting cluster (V,). Of a closed
+    surface also whether the vertex only closes a gap (V,).
 
     Positions are float64, in the world frame; lengths in meters.
     """
@@ -63,6 +67,18 @@ class Sheet(NamedTuple):
     faces: np.ndarray
     normals: np.ndarray
     thickness: np.ndarray
+    closing: np.ndarray | None = None
+
+    def without_unused(self) -> Sheet:
+        """The same surface without vertices that have no face."""
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.faces] = True
+        columns = {
+            name: values[used]
+            for name, values in self._asdict().items()
+            if values is not None and name != "faces"
+        }
+        return Sheet(faces=(np.cumsum(used) - 1)[self.faces], **columns)
 
 
 @torch.no_grad()
@@ -179,8 +195,15 @@ class _Follower:
     def examine(self, blocks: np.ndarray) -> _Batch:
         """The surface in some blocks, and the supported part of it."""
         values = self.lattice.values(self.model, blocks)
+        if self.rule.is_closed:
+            values[self.lattice.is_border(blocks)] = self.rule.level + LEAST_SHARE
         cut = march_blocks(values, self.rule.level, self.lattice.marched_cells(blocks))
-        edges = Edges.of(self.lattice, blocks, cut.edges, cut.shares)
+        shares = cut.shares
+        if (
+            self.rule.is_closed
+        ):  # no two vertices coincide, so files without indices are closed, too
+            shares = shares.clip(LEAST_SHARE, 1 - LEAST_SHARE)
+        edges = Edges.of(self.lattice, blocks, cut.edges, shares)
         rows = np.flatnonzero(edges.is_owned)
         points = torch.from_numpy(edges.select(rows).crossings(self.lattice))
         points = points.to(self.model.origin.device)

@@ -85,6 +85,12 @@ class Lattice:
         """(N, 3) lattice points -> (N, 3) place of the block, in blocks, that each belongs to."""
         return np.minimum(points // BLOCK_CELLS, self.shape - 1)
 
+    def is_border(self, blocks: np.ndarray) -> np.ndarray:
+        """(B, n, n, n) whether points of blocks lie on the border of the lattice or outside."""
+        places = self.place(blocks)[..., None] + np.arange(POINTS)  # (B, 3, n)
+        x, y, z = ((places <= 0) | (places >= self.cells[:, None])).transpose(1, 0, 2)
+        return x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]
+
     def edge_keys(self, points: np.ndarray, axes: np.ndarray) -> np.ndarray:
         """(N,) a number for each lattice edge, ascending with the number of its block.
 

@@ -84,7 +84,7 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
         sheet: part of a level set of its log-odds.
         resolution: edge of the cells that the surface was made with [m].
     """
-    vertices, faces, normals, thickness = sheet
+    vertices, faces, normals, thickness, _ = sheet
     normals = mean_with_neighbors(normals, faces)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     columns = (torch.from_numpy(c).to(model.origin.device) for c in (vertices, normals, thickness))
@@ -93,11 +93,11 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
     moved = vertices - np.nan_to_num(depths) * normals
     corners = depths[:, 0][faces]
     kept = corners.max(axis=1) - corners.min(axis=1) <= resolution  # a NaN compares as False
-    kept[kept] = ~_turned_over(moved, faces[kept], normals)
+    kept[kept] = ~turned_over(moved, faces[kept], normals)
     return Sheet(moved, faces[kept], normals, thickness)
 
 
-def _turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(F,) whether a face looks against the normals of its vertices."""
     a, b, c = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
     first, second = (b - a).astype(np.float32), (c - a).astype(np.float32)
