@@ -77,6 +77,11 @@ class Lattice:
         cell = cell[((cell >= 0) & (cell < self.cells)).all(axis=1)].astype(np.int64)
         return np.unique(np.ravel_multi_index((cell // BLOCK_CELLS).T, self.shape))
 
+    def block_places(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) world positions [m] -> (N, 3) int64 place of their blocks; also outside of the lattice."""
+        cell = np.floor(points / self.resolution).astype(np.int64) - self.first
+        return cell // BLOCK_CELLS
+
     def marched_cells(self, blocks: np.ndarray) -> np.ndarray:
         """(B, 3) int64 number of cells of each block; fewer at the far end of the lattice."""
         return np.minimum(BLOCK_CELLS, self.cells - self.place(blocks))

@@ -192,9 +192,11 @@ def lattice_mesh(
         return trimesh.Trimesh(process=False)
     sign, on_ridge = _sign(threshold), surface == "peak"
     bounds = lattice.bounds if lattice.is_cut else None
-    expected = estimate_mesh(model, lattice.resolution, bounds, sign, watertight=watertight)
-    bar = {"total": expected.faces, "desc": f"mesh, {expected}", "unit": " faces"}
-    with tqdm(**bar, disable=None if progress else True) as counter:
+    bar: dict[str, Any] = {"unit": " faces", "disable": None if progress else True}
+    if progress:
+        expected = estimate_mesh(model, lattice.resolution, bounds, sign, watertight=watertight)
+        bar |= {"total": expected.faces, "desc": f"mesh, {expected}"}
+    with tqdm(**bar) as counter:
 
         def count(faces: int) -> None:
             counter.update(faces)

@@ -99,11 +99,15 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
 
 def turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(F,) whether a face looks against the normals of its vertices."""
-    a, b, c = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
-    first, second = (b - a).astype(np.float32), (c - a).astype(np.float32)
-    looks = sum(normals.take(faces[:, corner], axis=0) for corner in range(3))
-    across = torch.linalg.cross(torch.from_numpy(first), torch.from_numpy(second)).numpy()
-    return np.einsum("ij,ij->i", across, looks) <= 0
+    near_zero = torch.from_numpy((vertices - vertices[:1]).astype(np.float32))
+    corners = torch.from_numpy(faces.astype(np.int64)).T
+    a, b, c = (near_zero.index_select(0, corner) for corner in corners)
+    across = torch.linalg.cross(b - a, c - a)
+    own = torch.from_numpy(normals.astype(np.float32))
+    looks = torch.zeros(len(faces))
+    for corner in corners:
+        looks += (across * own.index_select(0, corner)).sum(dim=1)
+    return (looks <= 0).numpy()
 
 
 def mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
