@@ -18,14 +18,11 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.cluster_matching import moved_factors
 from lardhm_torch.learning.clustering import (
     Clusters,
+    Grouped,
     clusters_from_moments,
-    split_labels,
 )
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
-from lardhm_torch.learning.points import at_most
 from lardhm_torch.native.thinning import BITS, priorities
-
-SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
 
 
 def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
@@ -238,29 +235,10 @@ def halves(evidence: Tensor) -> tuple[Tensor, Tensor]:
     return parts[0], parts[1]
 
 
-def fitted_evidence(
-    points: Tensor, labels: Tensor, state: MapState, rng: torch.Generator
-) -> Tensor:
-    """(M, E, D) evidence of clusters that were fitted to points of their classes.
-
-    It is chosen from a random subset of the points if there are many.
-
-    Args:
-        points: (N, D) positions [m], in the order of `morton_order`.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
-        state: M clusters, at least one of every class of the points.
-        rng: random generator of the subset.
-    """
-    evidence = torch.empty_like(state.evidence)
-    for kind, members in enumerate(split_labels(points, labels)):
-        rows = (state.kinds == kind).nonzero().squeeze(1)
-        if len(rows) == 0:
-            continue
-        count = SAMPLE_FACTOR * EVIDENCE * len(rows)
-        members = at_most(members, count, rng)
-        owners = native.nearest_centers(members, state.means[rows], 1).squeeze(1)
-        evidence[rows] = keep_points(members, owners, len(rows))
-    return evidence
+def fitted_evidence(grouped: Grouped) -> Tensor:
+    """(M, E, D) evidence of clusters that were fitted to points of their classes."""
+    parts = zip(grouped.classes, grouped.owners, grouped.numbers, strict=True)
+    return torch.cat([keep_points(points, owners, number) for points, owners, number in parts])
 
 
 def with_evidence(state: MapState, floor: float, rng: torch.Generator) -> Tensor:

@@ -41,7 +41,7 @@ def off_surfaces(points: Tensor, surfaces: Clusters, floor: float) -> Tensor:
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     covariances = surfaces.covariances
     factors = factor_covariances(covariances, floor)
-    normals = torch.linalg.eigh(covariances).eigenvectors[:, :, 0]
+    normals = native.symmetric_axes(covariances)[1][:, :, 0]
     owner = native.nearest_centers(points, surfaces.means, 1).squeeze(1)
     offsets = points - surfaces.means[owner]
     whitened = torch.linalg.solve_triangular(factors[owner], offsets[:, :, None], upper=False)
@@ -63,7 +63,11 @@ def draw_tails(
     volumes = sizes**dim
     for kind in (is_occupied, ~is_occupied):
         volumes[kind] /= volumes[kind].sum()
-    chosen = torch.multinomial(volumes, count, replacement=True, generator=rng)
+    bounds = volumes.double().cumsum(0)
+    place = torch.rand(count, generator=rng, device=rng.device, dtype=torch.float64)
+    place += torch.arange(count, device=rng.device)  # stratified
+    chosen = torch.searchsorted(bounds, place.to(bounds) * (bounds[-1] / count))
+    chosen.clamp_(max=len(volumes) - 1)
     factors = factor_covariances(covariances, floor)[chosen]
     shape = (count, dim)
     way = torch.randn(shape, generator=rng, device=rng.device).to(factors)
@@ -88,7 +92,7 @@ def settle_unknown(
         rng: random state.
 
     Returns:
-        (N', D) positions and (N',) labels, in Morton order.
+        (N', D) positions and (N',) labels; those in tails follow the others, each in Morton order.
     """
     is_unknown = labels == UNKNOWN
     if not bool(is_unknown.any()):
@@ -102,7 +106,6 @@ def settle_unknown(
     index = native.build_index(state.centers, kernel.num_neighbors)
     parameters = (state.centers, state.raw_scale_tril, kernel, index)
     features = native.nearest_features(tails, *parameters)[1].amax(dim=1)
-    tails = tails[features <= TAIL_FEATURE]
+    (tails,) = in_morton_order(tails[features <= TAIL_FEATURE])
     labels = torch.cat([labels[kept], labels.new_full((len(tails),), UNKNOWN)])
-    points, labels = in_morton_order(torch.cat([points_where(points, kept), tails]), labels)
-    return points, labels
+    return torch.cat([points_where(points, kept), tails]), labels

@@ -203,6 +203,14 @@ def mixture(
     return torch.cat(parts)
 
 
+def symmetric_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, D, D) symmetric matrices -> (M, D) eigenvalues, ascending, and (M, D, D) axes as columns."""
+    if supports(matrices[:, 0]):
+        return torch.ops.lardhm.symmetric_axes(matrices.detach())
+    values, axes = torch.linalg.eigh(matrices)
+    return values, axes
+
+
 def assign(
     points: Tensor, centers: Tensor, *, scatter: bool = True
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

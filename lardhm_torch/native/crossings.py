@@ -99,45 +99,21 @@ def _owners(count: int, levels: int, device: torch.device) -> Tensor:
 def find_patches(hits: Tensor) -> Patches:
     """Patches of (N, D) hits [m], N > 0."""
     levels = max(0, (len(hits) // PATCH_HITS).bit_length() - 1)
-    order = balanced_order(hits, levels)
-    if native.supports(hits):
-        means, covariances, variances, axes = torch.ops.lardhm.leaf_moments(
-            hits, order, levels, FLOOR
-        )
-    else:
-        means, covariances, variances, axes = leaf_moments(hits, order, levels, FLOOR)
-    spread = variances.sqrt()
-    precisions = (axes / variances[:, None]) @ axes.mT
-    is_flat = spread[:, 0] < FLAT * spread[:, 1]
-    return Patches(means, covariances, precisions, axes[:, :, 0], spread[:, 0], is_flat)
-
-
-def leaf_moments(
-    points: Tensor, order: Tensor, levels: int, floor: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Moments of the points in each leaf of a balanced k-d tree.
-
-    Args:
-        points: (N, D) positions [m].
-        order: (N,) rows of the points, leaf after leaf, see `balanced_order`.
-        levels: number of divisions.
-        floor: smallest standard deviation [m].
-
-    Returns:
-        (L, D) means [m]; (L, D, D) covariances [m^2]; (L, D) variances [m^2] along the axes, ascending;
-        (L, D, D) axes, as columns.
-    """
-    here = points[order]
-    owners, (count, dim) = _owners(len(points), levels, points.device), (1 << levels, points.shape[1])
-    sizes = torch.bincount(owners, minlength=count).to(points.dtype)
+    here = hits[balanced_order(hits, levels)]
+    owners, (count, dim) = _owners(len(hits), levels, hits.device), (1 << levels, hits.shape[1])
+    sizes = torch.bincount(owners, minlength=count).to(hits.dtype)
     means = here.new_zeros(count, dim).index_add_(0, owners, here) / sizes[:, None]
     offsets = here - means[owners]
     scatters = here.new_zeros(count, dim, dim)
     scatters.index_add_(0, owners, offsets[:, :, None] * offsets[:, None])
     covariances = scatters / (sizes - 1).clamp(min=1)[:, None, None]
-    covariances += floor**2 * torch.eye(dim, dtype=points.dtype, device=points.device)
-    variances, axes = torch.linalg.eigh(covariances)
-    return means, covariances, variances.clamp(min=floor**2), axes
+    covariances += FLOOR**2 * torch.eye(dim, dtype=hits.dtype, device=hits.device)
+    variances, axes = native.symmetric_axes(covariances)
+    variances = variances.clamp(min=FLOOR**2)
+    spread = variances.sqrt()
+    precisions = (axes / variances[:, None]) @ axes.mT
+    is_flat = spread[:, 0] < FLAT * spread[:, 1]
+    return Patches(means, covariances, precisions, axes[:, :, 0], spread[:, 0], is_flat)
 
 
 def passages(hits: Tensor, lines: Lines, ends: Tensor, margin: float) -> Passages:

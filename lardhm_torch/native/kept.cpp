@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "clusters.h"
-#include "eigen.h"
+#include "jacobi.h"
 #include "priority.h"
 
 namespace lardhm {
@@ -263,14 +263,13 @@ Tensors<4> follow_kept(
 // Direction of the largest eigenvalue of a symmetric matrix; its largest component is positive.
 template <int D>
 void longest_axis(const double* matrix, double* axis) {
-  const Eigen<D> found(matrix);
+  double values[D], axes[D][D];
+  jacobi<D>(matrix, values, axes);
   int largest = 0;
-  for (int i = 0; i < D; ++i) {
-    axis[i] = found.vectors[i][D - 1];
-    if (std::abs(axis[i]) > std::abs(axis[largest])) largest = i;
-  }
-  if (axis[largest] >= 0) return;
-  for (int i = 0; i < D; ++i) axis[i] = -axis[i];
+  for (int i = 1; i < D; ++i)
+    if (std::abs(axes[i][D - 1]) > std::abs(axes[largest][D - 1])) largest = i;
+  const double sign = axes[largest][D - 1] < 0 ? -1 : 1;
+  for (int i = 0; i < D; ++i) axis[i] = sign * axes[i][D - 1];
 }
 
 // The kept points of each cluster, divided at their mean along the longest axis.

@@ -9,7 +9,7 @@
 #include <utility>
 #include <vector>
 
-#include "eigen.h"
+#include "simd.h"
 #include "tensors.h"
 #include "threads.h"
 
@@ -77,66 +77,6 @@ Tensor balanced_order(const Tensor& given, int64_t levels) {
   return order;
 }
 
-// Moments and axes of a leaf's points, see `crossings.find_patches`.
-template <int D>
-struct Leaf {
-  double mean[D] = {}, covariance[D * D] = {};
-
-  Leaf(const double* points, const int64_t* rows, int64_t count, double floor) {
-    for (int64_t i = 0; i < count; ++i)
-      for (int d = 0; d < D; ++d) mean[d] += points[rows[i] * D + d];
-    for (int d = 0; d < D; ++d) mean[d] /= double(count);
-    for (int64_t i = 0; i < count; ++i)
-      for (int a = 0; a < D; ++a)
-        for (int b = 0; b < D; ++b)
-          covariance[a * D + b] +=
-              (points[rows[i] * D + a] - mean[a]) * (points[rows[i] * D + b] - mean[b]);
-    for (double& entry : covariance) entry /= double(std::max<int64_t>(1, count - 1));
-    for (int d = 0; d < D; ++d) covariance[d * D + d] += floor * floor;
-  }
-};
-
-template <int D>
-void write_leaves(const double* points, const int64_t* order, int64_t count, int64_t levels,
-                  double floor, const Tensors<4>& to) {
-  const int64_t leaves = int64_t(1) << levels;
-  constexpr int64_t kGrain = 64;
-  run_tasks((leaves + kGrain - 1) / kGrain, [&](int64_t task) {
-    for (int64_t i = task * kGrain; i < std::min(leaves, (task + 1) * kGrain); ++i) {
-      const int64_t first = i * count >> levels, stop = (i + 1) * count >> levels;
-      const Leaf<D> leaf(points, order + first, stop - first, floor);
-      const Eigen<D> axes(leaf.covariance);
-      std::copy_n(leaf.mean, D, out<double>(to[0]) + i * D);
-      std::copy_n(leaf.covariance, D * D, out<double>(to[1]) + i * D * D);
-      for (int d = 0; d < D; ++d) {
-        out<double>(to[2])[i * D + d] = std::max(axes.values[d], floor * floor);
-        for (int j = 0; j < D; ++j) out<double>(to[3])[(i * D + d) * D + j] = axes.vectors[d][j];
-      }
-    }
-  });
-}
-
-Tensors<4> leaf_moments(const Tensor& given, const Tensor& given_order, int64_t levels,
-                        double floor) {
-  const Tensor points = tidy(given), order = tidy(given_order);
-  const int64_t count = points.size(0), dim = points.size(1);
-  check(points.dim() == 2 && (dim == 2 || dim == 3) &&
-            points.scalar_type() == ScalarType::Double && order.numel() == count &&
-            order.scalar_type() == ScalarType::Long,
-        "points must be (N, 2) or (N, 3), float64, and order (N,) int64");
-  check(levels >= 0 && levels < 40 && count >> levels > 0, "a leaf must hold points");
-  for (int64_t i = 0; i < count; ++i)
-    check(in<int64_t>(order)[i] >= 0 && in<int64_t>(order)[i] < count, "order must hold rows");
-  const int64_t leaves = int64_t(1) << levels;
-  const Tensors<4> result{new_empty(points, {leaves, dim}), new_empty(points, {leaves, dim, dim}),
-                          new_empty(points, {leaves, dim}), new_empty(points, {leaves, dim, dim})};
-  if (dim == 2)
-    write_leaves<2>(doubles(points), in<int64_t>(order), count, levels, floor, result);
-  else
-    write_leaves<3>(doubles(points), in<int64_t>(order), count, levels, floor, result);
-  return result;
-}
-
 template <int D>
 struct Box {
   double low[D], high[D];
@@ -186,48 +126,110 @@ struct Ray {
   }
 };
 
-// The boxes of a binary tree with the leaves at the end: the children of node n are 2 n and 2 n + 1.
+// Eight boxes, a register for each bound, a little larger than their originals: single precision
+// excludes only boxes that double precision excludes, too.
+using Eight = Vectors<float, 32>;
+
+template <int D>
+struct Boxes {
+  Eight::V low[D], high[D];
+};
+
+template <int D>
+struct Sight {  // a ray in single precision
+  Eight::V start[D], inverse[D];
+  float end;
+
+  explicit Sight(const Ray<D>& ray) : end(float(ray.end * (1 + 1e-6))) {
+    for (int d = 0; d < D; ++d) {
+      start[d] = Eight::V{} + float(ray.start[d]);
+      inverse[d] = Eight::V{} + float(ray.inverse[d]);
+    }
+  }
+
+  // One bit for each box that the ray meets.
+  uint32_t meets(const Boxes<D>& boxes) const {
+    Eight::V enter = {}, leave = Eight::V{} + end;
+    for (int d = 0; d < D; ++d) {
+      const Eight::V one = (boxes.low[d] - start[d]) * inverse[d];
+      const Eight::V other = (boxes.high[d] - start[d]) * inverse[d];
+      enter = vmax(enter, vmin(one, other));
+      leave = vmin(leave, vmax(one, other));
+    }
+    return bits_le<Eight::I>(enter <= leave, Eight::I{} - 1);
+  }
+};
+
+// The boxes of a tree whose nodes have eight children each; the root has fewer.
 template <int D>
 class Forest {
-  std::vector<Box<D>> boxes;
+  std::vector<std::vector<Boxes<D>>> levels;  // from the children of the root to the leaves
+  std::vector<Box<D>> leaves;
   std::vector<Patch<D>> patches;
 
+  // Boxes in groups of eight. A bound is moved out by what a float may be wrong there.
+  static std::vector<Boxes<D>> grouped(const std::vector<Box<D>>& boxes, double far) {
+    constexpr double kRounding = 4e-6;
+    std::vector<Boxes<D>> groups((boxes.size() + 7) / 8);
+    for (size_t i = 0; i < 8 * groups.size(); ++i)
+      for (int d = 0; d < D; ++d) {
+        constexpr double kNowhere = 1e30;  // no ray meets what fills the last group
+        const bool is_box = i < boxes.size();
+        const double low = is_box ? boxes[i].low[d] : kNowhere;
+        const double high = is_box ? boxes[i].high[d] : kNowhere;
+        const double slack = is_box ? kRounding * (far + std::max(std::abs(low), std::abs(high))) : 0;
+        groups[i / 8].low[d][i % 8] = float(low - slack);
+        groups[i / 8].high[d][i % 8] = float(high + slack);
+      }
+    return groups;
+  }
+
  public:
+  // `far`: largest coordinate of a ray's start.
   Forest(const Tensor& low, const Tensor& high, const Tensor& means, const Tensor& precisions,
-         const Tensor& normals, const Tensor& clear)
-      : boxes(2 * low.size(0)), patches(low.size(0)) {
+         const Tensor& normals, const Tensor& clear, double far)
+      : leaves(low.size(0)), patches(low.size(0)) {
     const int64_t count = low.size(0);
     for (int64_t i = 0; i < count; ++i) {
-      std::copy_n(doubles(low) + i * D, D, boxes[count + i].low);
-      std::copy_n(doubles(high) + i * D, D, boxes[count + i].high);
+      std::copy_n(doubles(low) + i * D, D, leaves[i].low);
+      std::copy_n(doubles(high) + i * D, D, leaves[i].high);
       std::copy_n(doubles(means) + i * D, D, patches[i].mean);
       std::copy_n(doubles(precisions) + i * D * D, D * D, patches[i].precision);
       std::copy_n(doubles(normals) + i * D, D, patches[i].normal);
       patches[i].clear = doubles(clear)[i];
     }
-    for (int64_t i = count - 1; i > 0; --i)
-      for (int d = 0; d < D; ++d) {
-        boxes[i].low[d] = std::min(boxes[2 * i].low[d], boxes[2 * i + 1].low[d]);
-        boxes[i].high[d] = std::max(boxes[2 * i].high[d], boxes[2 * i + 1].high[d]);
+    std::vector<Box<D>> boxes = leaves;
+    levels.push_back(grouped(boxes, far));
+    while (boxes.size() > 8) {
+      for (size_t i = 0; i < boxes.size() / 8; ++i) {
+        Box<D> whole = boxes[8 * i];
+        for (int j = 1; j < 8; ++j)
+          for (int d = 0; d < D; ++d) {
+            whole.low[d] = std::min(whole.low[d], boxes[8 * i + j].low[d]);
+            whole.high[d] = std::max(whole.high[d], boxes[8 * i + j].high[d]);
+          }
+        boxes[i] = whole;
       }
+      boxes.resize(boxes.size() / 8);
+      levels.insert(levels.begin(), grouped(boxes, far));
+    }
   }
 
   // Appends the pairs of a ray, the patches in ascending order.
   void follow(const Ray<D>& ray, int64_t row, double limit,
               std::vector<std::pair<int64_t, int64_t>>& found) const {
-    const int64_t count = int64_t(patches.size());
-    int64_t waiting[64];
-    int depth = 0;
-    waiting[depth++] = 1;
-    while (depth) {
-      const int64_t node = waiting[--depth];
-      if (!ray.meets(boxes[node])) continue;
-      if (node < count) {
-        waiting[depth++] = 2 * node + 1;
-        waiting[depth++] = 2 * node;
-      } else if (ray.passes(patches[node - count], limit)) {
-        found.emplace_back(row, node - count);
-      }
+    descend(ray, Sight<D>(ray), 0, 0, row, limit, found);
+  }
+
+ private:
+  void descend(const Ray<D>& ray, const Sight<D>& sight, size_t level, int64_t group, int64_t row,
+               double limit, std::vector<std::pair<int64_t, int64_t>>& found) const {
+    for (uint32_t met = sight.meets(levels[level][group]); met; met &= met - 1) {
+      const int64_t node = 8 * group + __builtin_ctz(met);
+      if (level + 1 < levels.size())
+        descend(ray, sight, level + 1, node, row, limit, found);
+      else if (ray.meets(leaves[node]) && ray.passes(patches[node], limit))
+        found.emplace_back(row, node);
     }
   }
 };
@@ -286,7 +288,9 @@ std::array<Tensor, 2> passing(Tensor starts, Tensor ahead, Tensor reach, Tensor 
         "starts must be (R, D) or (1, D), depths (R,)");
   check_patches(ahead, low, high, means, precisions, normals, clear);
   const auto run = [&](auto dim) {
-    const Forest<dim()> forest(low, high, means, precisions, normals, clear);
+    double far = 0;
+    for (int64_t i = 0; i < starts.numel(); ++i) far = std::max(far, std::abs(doubles(starts)[i]));
+    const Forest<dim()> forest(low, high, means, precisions, normals, clear, far);
     return follow_all<dim()>(forest, starts, ahead, reach, ends, limit);
   };
   const std::vector<Pairs> found = ahead.size(1) == 2 ? run(std::integral_constant<int, 2>{})
@@ -311,9 +315,6 @@ namespace lardhm {
 std::vector<Operator> passages_operators() {
   return {
       {"balanced_order(Tensor points, int levels) -> Tensor", &boxed<passages::balanced_order>},
-      {"leaf_moments(Tensor points, Tensor order, int levels, float floor) -> (Tensor, Tensor, "
-       "Tensor, Tensor)",
-       &boxed<passages::leaf_moments>},
       {"passing(Tensor starts, Tensor ahead, Tensor reach, Tensor ends, Tensor low, Tensor high, "
        "Tensor means, Tensor precisions, Tensor normals, Tensor clear, float limit) -> (Tensor, "
        "Tensor)",
