@@ -201,6 +201,11 @@ def _file_verbs(verb: Any) -> None:
         metavar="N",
         help="simplify the mesh to about N faces",
     )
+    sub.add_argument(
+        "--watertight",
+        action="store_true",
+        help="close the surface where nothing was measured (gray; attribute closing in .ply)",
+    )
 
     sub = verb(queries.grid)
     sub.add_argument("map", metavar="MAP", help=MAP)

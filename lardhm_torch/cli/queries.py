@@ -54,9 +54,11 @@ def mesh(arguments: argparse.Namespace) -> None:
     _check_resolution(arguments.resolution)
     if arguments.faces is not None and arguments.faces < 1:
         raise ValueError(f"--faces must be at least 1; got {arguments.faces}")
-    surface = _surface(model, arguments)
+    surface = _surface(model, arguments, watertight=arguments.watertight)
     if arguments.faces is not None:
         surface = simplify_mesh(surface, arguments.faces)
+    if arguments.watertight and not surface.is_watertight:
+        raise ValueError("the map has no closed surface at this --resolution and number of --faces")
     save_mesh(surface, arguments.output)
     print(f"{len(surface.vertices)} vertices, {len(surface.faces)} faces -> {arguments.output}")
 
@@ -224,7 +226,9 @@ def info(arguments: argparse.Namespace) -> None:
         print(f"{name:<22}{value}")
 
 
-def _surface(model: LardHilbertMap | TiledMap, arguments: argparse.Namespace) -> trimesh.Trimesh:
+def _surface(
+    model: LardHilbertMap | TiledMap, arguments: argparse.Namespace, *, watertight: bool = False
+) -> trimesh.Trimesh:
     from lardhm_torch import extract_mesh
 
     return extract_mesh(
@@ -233,6 +237,7 @@ def _surface(model: LardHilbertMap | TiledMap, arguments: argparse.Namespace) ->
         arguments.threshold,
         surface=arguments.surface,
         color=arguments.color,
+        watertight=watertight,
         progress=True,
     )
 

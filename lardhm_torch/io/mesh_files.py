@@ -22,7 +22,7 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path) -> None:
 
     Far from zero (UTM), float32 is too coarse for a mesh. Then .ply stores float64, and .glb a mesh
     near zero with a translation; .obj and .off are text. .stl always stores float32, so a warning is
-    issued. .ply, .glb and .obj store vertex colors; .ply also the vertex attribute "label".
+    issued. .ply, .glb and .obj store vertex colors; .ply also integer vertex attributes ("label").
 
     Args:
         mesh: the mesh [m].
@@ -63,11 +63,10 @@ def _float64_ply(mesh: trimesh.Trimesh) -> bytes:
     has_colors = visual.kind == "vertex"
     if has_colors:
         vertex += [(name, "u1") for name in ("red", "green", "blue", "alpha")]
-    labels = mesh.vertex_attributes.get("label")
-    vertex += [] if labels is None else [("label", "<i4")]
+    vertex += [(name, "<i4") for name in mesh.vertex_attributes]
     vertices = np.zeros(len(mesh.vertices), vertex)
-    if labels is not None:
-        vertices["label"] = labels
+    for name, values in mesh.vertex_attributes.items():
+        vertices[name] = values
     columns = np.hstack([mesh.vertices, visual.vertex_colors]) if has_colors else mesh.vertices
     for (name, _), values in zip(vertex, columns.T, strict=False):
         vertices[name] = values

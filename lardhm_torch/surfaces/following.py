@@ -24,8 +24,17 @@ BATCH_BLOCKS = 1024  # examined at a time
 REGION_EDGE = 10.0  # [m] within which the surface is followed before other tiles are loaded
 PROBES = (1.0, 2.0, 3.0)  # standard deviations in front of and behind a vertex, where it is tested
 FREE_FACTOR = 2.0  # on the margin in front, where free space can leak through walls
+LEAST_SHARE = 0.01  # of a lattice edge between its end and a vertex of a closed surface
 SEED_RADII = torch.linspace(0, 4.5, 10)  # standard deviations from a center
 SEED_CLUSTERS = 1 << 12  # whose lines are evaluated at a time
+_WAYS = torch.tensor([*itertools.product((-1.0, 0.0, 1.0), repeat=3)], dtype=torch.float64)
+SHORTEST = _WAYS[(_WAYS[:, :2] == 0).all(dim=1) & (_WAYS[:, 2] != 0)]  # lines by the principal axes
+OTHERS = torch.cat(
+    [
+        _WAYS[(_WAYS.abs().sum(dim=1) == 1) & (_WAYS[:, 2] == 0)],
+        _WAYS[_WAYS.abs().sum(dim=1) == 3] / 3**0.5,
+    ]
+)
 
 
 class Rule(NamedTuple):
@@ -35,11 +44,13 @@ class Rule(NamedTuple):
         level: log-odds of the surface.
         sign: of the weights of the supporting clusters.
         log_odds_margin: required beyond the level on both sides of a face; None: none.
+        is_closed: whether the border of the lattice is above the level, so that the surface ends nowhere.
     """
 
     level: float
     sign: int
     log_odds_margin: float | None
+    is_closed: bool = False
 
     @property
     def lowest(self) -> float:
@@ -54,7 +65,8 @@ class Rule(NamedTuple):
 
 class Sheet(NamedTuple):
     """A surface: vertices (V, 3) and faces (F, 3), and for each vertex its unit normal (V, 3), against
-    the gradient of the log-odds, and the thickness of the nearest supporting cluster (V,).
+    the gradient of the log-odds, and the thickness of the nearest supporting cluster (V,). Of a closed
+    surface also whether the vertex only closes a gap (V,).
 
     Positions are float64, in the world frame; lengths in meters.
     """
@@ -63,6 +75,18 @@ class Sheet(NamedTuple):
     faces: np.ndarray
     normals: np.ndarray
     thickness: np.ndarray
+    closing: np.ndarray | None = None
+
+    def without_unused(self) -> Sheet:
+        """The same surface without vertices that have no face."""
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.faces] = True
+        columns = {
+            name: values[used]
+            for name, values in self._asdict().items()
+            if values is not None and name != "faces"
+        }
+        return Sheet(faces=(np.cumsum(used) - 1)[self.faces], **columns)
 
 
 @torch.no_grad()
@@ -113,30 +137,45 @@ def follow_surface(
 def seed_blocks(model: OccupancyMap, lattice: Lattice, rule: Rule) -> np.ndarray:
     """Blocks in which the level set crosses a line that starts at the center of a supporting cluster.
 
-    From each center, lines run along the principal axes and between all three of them, as far as
-    `SEED_RADII`. Lines without the margin on either side of the level count only if none is required.
+    From each center, two lines run along the shortest principal axis, as far as `SEED_RADII`. If they do
+    not cross the surface, lines along the other axes and between all three follow. One of several
+    clusters that reach the same blocks is enough. Lines without the margin on either side of the level
+    count only if none is required.
     """
-    ways = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)), dtype=torch.float64)
-    ways = ways[(ways.abs().sum(dim=1) == 1) | (ways.abs().sum(dim=1) == 3)]
-    ways = ways / ways.norm(dim=1, keepdim=True)
     found = [np.zeros(0, dtype=np.int64)]
     for piece in pieces(model, lattice.bounds if lattice.is_cut else None):
         chosen = _near(piece, lattice, rule.sign)
         for rows in chosen.split(SEED_CLUSTERS):
             axes, stds, _ = torch.linalg.svd(piece.scale_tril.detach()[rows].double())
             centers = piece.centers.detach()[rows].double() + piece.origin
-            steps = ways.to(centers.device) @ (axes * stds[:, None]).mT  # (R, W, 3)
-            radii = SEED_RADII.to(steps)[:, None, None, None]
-            lines = centers[:, None] + radii * steps  # (S, R, W, 3)
-            log_odds = model.log_odds(lines)
-            inside = log_odds > rule.level
-            crossed = inside[1:] != inside[:-1]
-            if rule.log_odds_margin is not None:
-                crossed &= log_odds.amax(dim=0) > rule.highest
-                crossed &= log_odds.amin(dim=0) < rule.lowest
-            ends = torch.cat([lines[1:][crossed], lines[:-1][crossed]])
-            found.append(lattice.blocks_at(ends.cpu().numpy()))
+            left = _apart(lattice, centers, SEED_RADII[4] * axes[..., 2] * stds[:, 2:])
+            for ways in (SHORTEST, OTHERS):
+                steps = ways.to(centers) @ (axes[left] * stds[left, None]).mT  # (R, W, 3)
+                radii = SEED_RADII.to(steps)[:, None, None, None]
+                lines = centers[left, None] + radii * steps  # (S, R, W, 3)
+                crossed, ends = _crossed(model, lines, rule)
+                found.append(lattice.blocks_at(ends.cpu().numpy()))
+                left = left[~crossed]
     return np.unique(np.concatenate(found))
+
+
+def _apart(lattice: Lattice, centers: Tensor, reach: Tensor) -> Tensor:
+    """Rows of the centers (R, 3), without those that reach the same two blocks to either side (R, 3)."""
+    sides = [lattice.block_places((centers + sign * reach).cpu().numpy()) for sign in (-1, 1)]
+    _, first = np.unique(np.hstack(sides), axis=0, return_index=True)
+    return torch.from_numpy(np.sort(first)).to(centers.device)
+
+
+def _crossed(model: OccupancyMap, lines: Tensor, rule: Rule) -> tuple[Tensor, Tensor]:
+    """(S, R, W, 3) points along lines -> (R,) whether any of W lines crosses the surface, and both ends of
+    the steps that do (N, 3)."""
+    log_odds = model.log_odds(lines)
+    inside = log_odds > rule.level
+    crossed = inside[1:] != inside[:-1]
+    if rule.log_odds_margin is not None:
+        crossed &= log_odds.amax(dim=0) > rule.highest
+        crossed &= log_odds.amin(dim=0) < rule.lowest
+    return crossed.any(dim=2).any(dim=0), torch.cat([lines[1:][crossed], lines[:-1][crossed]])
 
 
 def _near(piece: OccupancyMap, lattice: Lattice, sign: int) -> Tensor:
@@ -179,8 +218,15 @@ class _Follower:
     def examine(self, blocks: np.ndarray) -> _Batch:
         """The surface in some blocks, and the supported part of it."""
         values = self.lattice.values(self.model, blocks)
+        if self.rule.is_closed:
+            values[self.lattice.is_border(blocks)] = self.rule.level + LEAST_SHARE
         cut = march_blocks(values, self.rule.level, self.lattice.marched_cells(blocks))
-        edges = Edges.of(self.lattice, blocks, cut.edges, cut.shares)
+        shares = cut.shares
+        if (
+            self.rule.is_closed
+        ):  # no two vertices coincide, so files without indices are closed, too
+            shares = shares.clip(LEAST_SHARE, 1 - LEAST_SHARE)
+        edges = Edges.of(self.lattice, blocks, cut.edges, shares)
         rows = np.flatnonzero(edges.is_owned)
         points = torch.from_numpy(edges.select(rows).crossings(self.lattice))
         points = points.to(self.model.origin.device)

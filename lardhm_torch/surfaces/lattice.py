@@ -77,6 +77,11 @@ class Lattice:
         cell = cell[((cell >= 0) & (cell < self.cells)).all(axis=1)].astype(np.int64)
         return np.unique(np.ravel_multi_index((cell // BLOCK_CELLS).T, self.shape))
 
+    def block_places(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) world positions [m] -> (N, 3) int64 place of their blocks; also outside of the lattice."""
+        cell = np.floor(points / self.resolution).astype(np.int64) - self.first
+        return cell // BLOCK_CELLS
+
     def marched_cells(self, blocks: np.ndarray) -> np.ndarray:
         """(B, 3) int64 number of cells of each block; fewer at the far end of the lattice."""
         return np.minimum(BLOCK_CELLS, self.cells - self.place(blocks))
@@ -84,6 +89,12 @@ class Lattice:
     def owners(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) lattice points -> (N, 3) place of the block, in blocks, that each belongs to."""
         return np.minimum(points // BLOCK_CELLS, self.shape - 1)
+
+    def is_border(self, blocks: np.ndarray) -> np.ndarray:
+        """(B, n, n, n) whether points of blocks lie on the border of the lattice or outside."""
+        places = self.place(blocks)[..., None] + np.arange(POINTS)  # (B, 3, n)
+        x, y, z = ((places <= 0) | (places >= self.cells[:, None])).transpose(1, 0, 2)
+        return x[:, :, None, None] | y[:, None, :, None] | z[:, None, None, :]
 
     def edge_keys(self, points: np.ndarray, axes: np.ndarray) -> np.ndarray:
         """(N,) a number for each lattice edge, ascending with the number of its block.

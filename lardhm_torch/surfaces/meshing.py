@@ -25,9 +25,10 @@ from lardhm_torch.queries.grids import (
     grid_axes,
     threshold_log_odds,
 )
-from lardhm_torch.surfaces.channel_colors import class_labels, label_colors
+from lardhm_torch.surfaces.channel_colors import UNKNOWN_COLOR, class_labels, label_colors
+from lardhm_torch.surfaces.closing import closed_sheet
 from lardhm_torch.surfaces.estimate import check_mesh_memory, estimate_mesh
-from lardhm_torch.surfaces.following import Rule, follow_surface, seed_blocks
+from lardhm_torch.surfaces.following import Rule, Sheet, follow_surface, seed_blocks
 from lardhm_torch.surfaces.lattice import Lattice, blocks_near_boxes, border_blocks
 from lardhm_torch.surfaces.ridge import sheet_on_ridge
 from lardhm_torch.surfaces.vertex_colors import COLORS, vertex_colors
@@ -46,6 +47,7 @@ def extract_mesh(
     surface: str = "peak",
     color: str | None = "height",
     log_odds_margin: float | None = LOG_ODDS_MARGIN,
+    watertight: bool = False,
     progress: bool = False,
 ) -> trimesh.Trimesh:
     """Surface mesh of occupied space; normals point into free space.
@@ -67,6 +69,11 @@ def extract_mesh(
     as much in front. Without this rule, there would be faces in unmeasured space, where the log-odds
     vary around 0, and on the backs of walls. The rule does not depend on the resolution.
 
+    A mesh of measured surfaces is open where nothing was measured. With ``watertight``, it is the whole
+    boundary of the space known to be free (by one margin), which counts everything else as occupied and
+    ends at the bounds: two faces at each edge, normals to the inside. Where there is no measured surface,
+    it closes the gap. Vertices there are gray, and 1 in the vertex attribute "closing" (0 elsewhere).
+
     Args:
         model: a 3-D map.
         resolution: edge of a lattice cell [m]. With cells much larger than the thickness of a
@@ -78,10 +85,11 @@ def extract_mesh(
             cluster), "probability" (at the center of that cluster), "variance" (of the log-odds,
             dark where certain; needs `LardHilbertMap.fit_uncertainty`), the name of a channel of the
             map ("color", "intensity", "class", ...; gray where it is unknown), or None. Meshes
-            colored by class have the class numbers as vertex attribute "label", -1 where unknown,
-            which `save_mesh` writes to .ply.
+            colored by class have the class numbers as vertex attribute "label", -1 where unknown.
+            `save_mesh` writes vertex attributes to .ply.
         log_odds_margin: required on both sides of a face, see above; None keeps all faces, which takes
             time and memory in proportion to the volume.
+        watertight: close the surface where nothing was measured, see above.
         progress: show a progress bar.
 
     Returns:
@@ -95,13 +103,15 @@ def extract_mesh(
     Source: Guizilini & Ramos 2016, Section IV (marching cubes, colors of the nearest cluster).
     """
     _check_meshing(model, resolution, threshold, log_odds_margin)
+    if watertight:
+        _check_watertight(threshold, log_odds_margin)
     colors = (*COLORS, *channel_names(model), None)
     for name, value, allowed in (("surface", surface, SURFACES), ("color", color, colors)):
         if value not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}; got {value!r}")
     if color == "variance":
         log_odds_variance(model, model.origin[None])  # raises now rather than after minutes
-    lattice = surface_lattice(model, resolution, threshold, bounds)
+    lattice = surface_lattice(model, resolution, threshold, bounds, watertight=watertight)
     return lattice_mesh(
         model,
         lattice,
@@ -109,6 +119,7 @@ def extract_mesh(
         surface=surface,
         color=color,
         log_odds_margin=log_odds_margin,
+        watertight=watertight,
         progress=progress,
     )
 
@@ -120,6 +131,7 @@ def surface_lattice(
     bounds: tuple[TensorLike, TensorLike] | None = None,
     *,
     keep: bool = False,
+    watertight: bool = False,
 ) -> Lattice | None:
     """Lattice for `lattice_mesh`, valid for all thresholds on the same side of 1/2.
 
@@ -130,7 +142,7 @@ def surface_lattice(
     Returns:
         The lattice; None if no supporting cluster is near the bounds.
     """
-    sign, corners = _sign(threshold), None
+    sign, corners = -1 if watertight else _sign(threshold), None
     if bounds is not None:
         corner, end = (to_tensor(b, "bounds").cpu() for b in bounds)
         corners = corner, end
@@ -143,7 +155,8 @@ def surface_lattice(
         lower, upper = lower[touching], upper[touching]
     if len(lower) == 0:
         return None
-    check_mesh_memory(resolution, estimate_mesh(model, resolution, corners, sign))
+    expected = estimate_mesh(model, resolution, corners, _sign(threshold), watertight=watertight)
+    check_mesh_memory(resolution, expected)
     if bounds is None:
         first, last = (
             np.floor(lower.min(axis=0) / resolution),
@@ -164,6 +177,7 @@ def lattice_mesh(
     surface: str = "peak",
     color: str | None = "height",
     log_odds_margin: float | None = LOG_ODDS_MARGIN,
+    watertight: bool = False,
     progress: bool = False,
     report: Callable[[int], object] = lambda _: None,
 ) -> trimesh.Trimesh:
@@ -176,36 +190,35 @@ def lattice_mesh(
 
     if lattice is None:
         return trimesh.Trimesh(process=False)
-    sign = _sign(threshold)
-    rule = Rule(threshold_log_odds(threshold), sign, log_odds_margin)
-    boxes = cluster_boxes(model, sign, lattice.bounds if lattice.is_cut else None)
-    if log_odds_margin is None:
-        starts = blocks_near_boxes(lattice, *boxes)
-    else:
-        starts = seed_blocks(model, lattice, rule)
-        if lattice.is_cut:  # a surface that comes from outside the bounds crosses them
-            starts = np.union1d(starts, border_blocks(lattice, *boxes))
-    allowed = starts if log_odds_margin is None else None
-    expected = estimate_mesh(model, lattice.resolution, lattice.bounds, sign)
-    bar = {"total": expected.faces, "desc": f"mesh, {expected}", "unit": " faces"}
-    with tqdm(**bar, disable=None if progress else True) as counter:
-        sheet = follow_surface(
-            model, lattice, starts, rule, allowed, lambda n: (counter.update(n), report(n))
-        )
+    sign, on_ridge = _sign(threshold), surface == "peak"
+    bounds = lattice.bounds if lattice.is_cut else None
+    bar: dict[str, Any] = {"unit": " faces", "disable": None if progress else True}
+    if progress:
+        expected = estimate_mesh(model, lattice.resolution, bounds, sign, watertight=watertight)
+        bar |= {"total": expected.faces, "desc": f"mesh, {expected}"}
+    with tqdm(**bar) as counter:
+
+        def count(faces: int) -> None:
+            counter.update(faces)
+            report(faces)
+
+        if watertight:
+            margin = log_odds_margin or 0.0
+            sheet = closed_sheet(model, lattice, threshold, margin, on_ridge=on_ridge, report=count)
+        else:
+            sheet = _open_sheet(model, lattice, threshold, log_odds_margin, count)
+            if on_ridge:
+                sheet = sheet_on_ridge(model, sheet, lattice.resolution)
     report(0)
-    if surface == "peak":
-        sheet = sheet_on_ridge(model, sheet, lattice.resolution)
-        report(0)
-    vertices, faces, normals, _ = sheet
-    used = np.zeros(len(vertices), dtype=bool)
-    used[faces] = True
-    vertices, normals, faces = vertices[used], normals[used], (np.cumsum(used) - 1)[faces]
-    attributes: dict[str, Any] = {}
+    vertices, faces, normals, _, closing = sheet.without_unused()
+    attributes: dict[str, Any] = {} if closing is None else {"closing": closing.astype(np.int32)}
     if color == CLASS and len(vertices):
         attributes["label"] = class_labels(model, vertices)
         colors: np.ndarray | None = label_colors(attributes["label"])
     else:
         colors = vertex_colors(model, vertices, sign, color)
+    if colors is not None and closing is not None:
+        colors[closing, :3] = UNKNOWN_COLOR
     return trimesh.Trimesh(
         vertices,
         faces,
@@ -214,6 +227,25 @@ def lattice_mesh(
         vertex_attributes=attributes,
         process=False,
     )
+
+
+def _open_sheet(
+    model: OccupancyMap,
+    lattice: Lattice,
+    threshold: float,
+    log_odds_margin: float | None,
+    report: Callable[[int], object],
+) -> Sheet:
+    """The measured parts of the level set at a threshold."""
+    rule = Rule(threshold_log_odds(threshold), _sign(threshold), log_odds_margin)
+    boxes = cluster_boxes(model, rule.sign, lattice.bounds if lattice.is_cut else None)
+    if log_odds_margin is None:
+        starts = blocks_near_boxes(lattice, *boxes)
+        return follow_surface(model, lattice, starts, rule, allowed=starts, report=report)
+    starts = seed_blocks(model, lattice, rule)
+    if lattice.is_cut:  # a surface that comes from outside the bounds crosses them
+        starts = np.union1d(starts, border_blocks(lattice, *boxes))
+    return follow_surface(model, lattice, starts, rule, report=report)
 
 
 def _check_meshing(
@@ -231,6 +263,16 @@ def _check_meshing(
     if log_odds_margin is not None and not log_odds_margin >= 0:
         raise ValueError(
             f"log_odds_margin must be >= 0, or None to keep all faces; got {log_odds_margin}"
+        )
+
+
+def _check_watertight(threshold: float, log_odds_margin: float | None) -> None:
+    if log_odds_margin is None:
+        raise ValueError("log_odds_margin must be a number with watertight; got None")
+    if threshold_log_odds(threshold) >= log_odds_margin:
+        raise ValueError(
+            "threshold must be lower with watertight, or unmeasured space would count as free; got "
+            f"{threshold}, whose log-odds are not below log_odds_margin = {log_odds_margin}"
         )
 
 

@@ -84,7 +84,7 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
         sheet: part of a level set of its log-odds.
         resolution: edge of the cells that the surface was made with [m].
     """
-    vertices, faces, normals, thickness = sheet
+    vertices, faces, normals, thickness, _ = sheet
     normals = mean_with_neighbors(normals, faces)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     columns = (torch.from_numpy(c).to(model.origin.device) for c in (vertices, normals, thickness))
@@ -93,17 +93,21 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
     moved = vertices - np.nan_to_num(depths) * normals
     corners = depths[:, 0][faces]
     kept = corners.max(axis=1) - corners.min(axis=1) <= resolution  # a NaN compares as False
-    kept[kept] = ~_turned_over(moved, faces[kept], normals)
+    kept[kept] = ~turned_over(moved, faces[kept], normals)
     return Sheet(moved, faces[kept], normals, thickness)
 
 
-def _turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def turned_over(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(F,) whether a face looks against the normals of its vertices."""
-    a, b, c = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
-    first, second = (b - a).astype(np.float32), (c - a).astype(np.float32)
-    looks = sum(normals.take(faces[:, corner], axis=0) for corner in range(3))
-    across = torch.linalg.cross(torch.from_numpy(first), torch.from_numpy(second)).numpy()
-    return np.einsum("ij,ij->i", across, looks) <= 0
+    near_zero = torch.from_numpy((vertices - vertices[:1]).astype(np.float32))
+    corners = torch.from_numpy(faces.astype(np.int64)).T
+    a, b, c = (near_zero.index_select(0, corner) for corner in corners)
+    across = torch.linalg.cross(b - a, c - a)
+    own = torch.from_numpy(normals.astype(np.float32))
+    looks = torch.zeros(len(faces))
+    for corner in corners:
+        looks += (across * own.index_select(0, corner)).sum(dim=1)
+    return (looks <= 0).numpy()
 
 
 def mean_with_neighbors(values: np.ndarray, faces: np.ndarray) -> np.ndarray:
