@@ -51,7 +51,8 @@ def even_kernels(state: MapState, floor: float) -> MapState:
         rows = (state.kinds == kind).nonzero().squeeze(1)
         if len(rows):
             means = state.means[rows]
-            around = spread[rows][native.nearest_centers(means, means, AROUND)]
+            extents = spread[rows].where(spread[rows] > 0, torch.inf)  # of single points: unknown
+            around = extents[native.nearest_centers(means, means, AROUND)]
             limit[rows] = LARGEST**2 * around.median(dim=1).values
     rows = (spread > limit).nonzero().squeeze(1)
     values, axes = values[rows].minimum(limit[rows, None]), axes[rows]
