@@ -172,13 +172,9 @@ def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor)
 
 
 def evidence_weights(state: MapState, kept: Tensor) -> Tensor:
-    """(M,) weight of each kept point of a cluster.
-
-    A kept point represents count / kept points. Its weight is the square root of that, between one
-    weight for each point that was seen and one for each point that is kept.
-    """
+    """(M,) weight of each kept point of a cluster: the number of points that it represents."""
     represented = state.counts / kept.clamp(min=1)
-    return represented.clamp(min=1).sqrt().to(state.weights)
+    return represented.clamp(min=1).to(state.weights)
 
 
 def balanced(
