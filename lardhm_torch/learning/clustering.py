@@ -271,11 +271,11 @@ def choose_num_clusters(
     Args:
         points: (N, D) positions [m].
         fine: use one cluster per `CELLS_PER_SCAN_CLUSTER` cells instead.
-        represented: number of points that these are a sample of, if they are one.
+        represented: number of points that these represent; 0: themselves.
         share: of all points of the map, for a part of it: dense points of all parts have at most
             `MAX_CHOSEN` clusters together.
     """
-    size = max(len(points), represented)
+    size = represented or len(points)
     count = count_cells(points, CELL_EDGE)
     few = min(count, max_singletons(size))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))

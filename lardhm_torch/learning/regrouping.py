@@ -259,7 +259,7 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     sizes = groups.sizes + received
     alive = sizes >= (1 if rule.few else MIN_COUNT)
     inertia = _inertia(groups.state, groups.sizes, received)
-    occupied = rule.occupied
+    most = MORE * rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = groups.rows(kind)
         some = alive[own]
@@ -268,11 +268,13 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
         if not rule.few:
             some &= ~_needless(groups.state.means[own], inertia[own], sizes[own], some)
         known = int((own < before).sum())
-        limit = int(MORE * factor * occupied) if rule.grows else max(factor * occupied, known)
+        limit = int(factor * most) if rule.grows else max(factor * rule.occupied, known)
         excess = int(some.sum()) - max(1, limit)
         if excess > 0:
             order = torch.where(some, inertia[own], torch.inf).argsort(stable=True)
             some[order[:excess]] = False
+        if kind == 0:
+            most = max(MORE * int(some.sum()), rule.occupied)
         alive[own] = some
     return alive
 

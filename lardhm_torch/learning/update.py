@@ -180,8 +180,8 @@ def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None, total
     if num_clusters is not None:
         return num_clusters // 4
     kept, _ = kept_points(part.evidence, part.is_occupied.nonzero().squeeze(1))
-    size = int(part.counts[part.is_occupied].sum()) + len(hits)
-    share = size / max(1, total + len(hits))
+    size = max(int(part.counts[part.is_occupied].sum()), len(hits))  # most hits may be known
+    share = size / max(1, total, len(hits))
     return choose_num_clusters(torch.cat([kept, hits]), represented=size, share=share)
 
 
