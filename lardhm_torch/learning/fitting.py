@@ -18,7 +18,7 @@ from lardhm_torch.learning.clustering import group_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.points import blurred_hits, check_noise
-from lardhm_torch.learning.unseen import settle_unknown
+from lardhm_torch.learning.unseen import even_kernels, settle_unknown
 
 CHUNK_ROWS = 1 << 21  # number of points whose features are computed at a time
 PASSES, MIN_STEPS = 4, 256  # small data sets need more passes for enough steps
@@ -121,9 +121,9 @@ def fit_clusters(
 
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
+    floor = task.kernel.min_lengthscale
     grouped = group_classes(points, labels, num_clusters, task.rng)
-    evidence = fitted_evidence(grouped)
-    state = new_rows(*grouped[:2], task.kernel.min_lengthscale, evidence)
+    state = even_kernels(new_rows(*grouped[:2], floor, fitted_evidence(grouped)), floor)
     if task.config.bridge_gaps:
         state, points, labels = bridged(state, points, labels, task.kernel, task.rng)
     points, labels = settle_unknown(points, labels, state, task.kernel, task.rng)

@@ -10,7 +10,7 @@ from lardhm_torch.learning.points import at_most
 from lardhm_torch.native import nearest_centers
 from lardhm_torch.sampling import spread_rows
 
-START_POINTS = 20  # number of random points per center from which initial centers are chosen
+START_POINTS = 50  # number of random points per center from which initial centers are chosen
 ITERATIONS = 20  # t in Algorithm 1
 
 

@@ -8,22 +8,56 @@ contributions, so that the other clusters need not represent unobserved space.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.features import Kernel
+from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.learning.clustering import Clusters, points_where
 from lardhm_torch.learning.map_state import MapState, factor_covariances
 from lardhm_torch.learning.points import in_morton_order
 from lardhm_torch.sampling import UNKNOWN
 
+LARGEST = 1.25  # largest extent of a kernel, relative to the median ...
+AROUND = 24  # ... of so many nearest clusters, itself among them
 INSIDE = 6.0  # standard deviations from a surface's cluster: nothing there is unknown ...
 SURFACE = 0.25  # [m] ... nor farther than this from its plane: wider clusters are no surfaces
 TAILS = (2.0, 5.0)  # standard deviations from a cluster: where its tail is
 TAIL_FEATURE = 0.4  # no cluster holds a place where no feature is larger
 TAILS_PER_CLUSTER = 3  # at least ...
 SAMPLES_PER_TAIL = 14  # ... and one for so many samples, so that large clusters have enough
+
+
+def even_kernels(state: MapState, floor: float) -> MapState:
+    """The clusters, of which those much larger than their neighbors have smaller kernels.
+
+    A few hits far apart make a cluster that reaches meters into space that no ray observed, and only
+    its tails have samples there. The extents of a kernel are at most `LARGEST` times the median of those
+    of the nearest clusters of its class. The moments do not change. Free clusters keep their kernels,
+    because free space is known between its samples. Without unknown clusters nothing changes.
+
+    Args:
+        state: M new clusters.
+        floor: smallest standard deviation [m].
+    """
+    if not bool((state.kinds == 2).any()):
+        return state
+    values, axes = native.symmetric_axes(state.clusters.covariances)
+    spread = values[:, -1]
+    limit = torch.full_like(spread, torch.inf)
+    for kind in (0, 2):
+        rows = (state.kinds == kind).nonzero().squeeze(1)
+        if len(rows):
+            means = state.means[rows]
+            extents = spread[rows].where(spread[rows] > 0, torch.inf)  # of single points: unknown
+            around = extents[native.nearest_centers(means, means, AROUND)]
+            limit[rows] = LARGEST**2 * around.median(dim=1).values
+    rows = (spread > limit).nonzero().squeeze(1)
+    values, axes = values[rows].minimum(limit[rows, None]), axes[rows]
+    smaller = raw_factors(factor_covariances((axes * values[:, None]) @ axes.mT, floor))
+    return replace(state, raw_scale_tril=state.raw_scale_tril.index_copy(0, rows, smaller))
 
 
 def off_surfaces(points: Tensor, surfaces: Clusters, floor: float) -> Tensor:
