@@ -78,7 +78,7 @@ class Lattice:
         return np.unique(np.ravel_multi_index((cell // BLOCK_CELLS).T, self.shape))
 
     def block_places(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) world positions [m] -> (N, 3) int64 place of their blocks; also outside of the lattice."""
+        """(N, 3) world positions [m] -> (N, 3) int64 place of their blocks, also outside the lattice."""
         cell = np.floor(points / self.resolution).astype(np.int64) - self.first
         return cell // BLOCK_CELLS
 
