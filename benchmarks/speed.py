@@ -36,8 +36,9 @@ from timing import Contender, compare, format_comparison, format_rows
 from workers import plain_path
 
 from lardhm_torch import FitConfig, LardHilbertMap, native
-from lardhm_torch.learning.clustering import clusters_from_moments, mini_batch_kmeans
+from lardhm_torch.learning.clustering import clusters_from_moments
 from lardhm_torch.learning.fitting import fit_weights, stratified_batches
+from lardhm_torch.learning.kmeans import mini_batch_kmeans
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.learning.points import in_morton_order
 

@@ -5,7 +5,14 @@ import torch
 
 from lardhm_torch import FitConfig, LardHilbertMap, Scans, raycast, sample_rays
 from lardhm_torch.features import Kernel
-from lardhm_torch.learning.bridging import EDGE, REACH, bridged, find_gaps, find_plates
+from lardhm_torch.learning.bridging import (
+    EDGE,
+    REACH,
+    bridged,
+    close_points,
+    find_gaps,
+    find_plates,
+)
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.sampling import UNKNOWN
@@ -132,3 +139,14 @@ def test_the_floor_between_the_rings_of_a_lidar_ends_rays(seed):
         found.append(float(((got - between.ranges).abs() < 0.2).double().mean()))
     assert found[0] < 0.2
     assert found[1] > 0.8
+
+
+def test_no_point_near_a_place_is_left_out_before_the_search():
+    rng = torch.Generator().manual_seed(4)
+    points = 20 * torch.rand(20_000, 3, generator=rng) - 10
+    places, radius = points[:50] + 0.1, 0.3
+    found = close_points(points, places, radius)
+    near = torch.cdist(points, places).amin(dim=1) < radius
+    assert near.any()
+    assert len(found) < 5000
+    assert bool((found[:, None] == points[near]).all(dim=2).any(dim=0).all())

@@ -13,11 +13,12 @@ from lardhm_torch.learning.clustering import (
     cluster_classes,
     cluster_points,
     clusters_from_moments,
+    group_classes,
     merge_small,
-    mini_batch_kmeans,
     pool_clusters,
     split_clusters,
 )
+from lardhm_torch.learning.kmeans import mini_batch_kmeans
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.learning.points import morton_order
 
@@ -89,13 +90,27 @@ def test_every_point_belongs_to_one_cluster_and_none_is_small():
 def test_small_clusters_join_their_nearest_neighbor():
     points = torch.tensor([[0.0]] * 5 + [[1.0]] * 2 + [[10.0]] * 6, dtype=F64)
     labels = torch.tensor([0] * 5 + [1] * 2 + [3] * 6)
-    merged = merge_small(cluster_moments(points, labels, 4))
+    merged, groups = merge_small(cluster_moments(points, labels, 4))
+    assert groups.tolist() == [0, 0, 0, 1]  # the empty one, too, has a place
     assert merged.counts.tolist() == [7, 6]
     torch.testing.assert_close(merged.means[0], points[:7].mean(dim=0))
 
 
+def test_each_class_has_its_clusters_and_they_own_its_points():
+    points, g = blobs(), rng()
+    labels = torch.rand(len(points), generator=g).mul(3).floor() / 2
+    found = group_classes(points, labels.to(points), 60, g)
+    first = 0
+    for members, owners, number in zip(found.classes, found.owners, found.numbers, strict=True):
+        means = torch.zeros(number, 3, dtype=points.dtype).index_add_(0, owners.long(), members)
+        sizes = torch.bincount(owners, minlength=number)
+        own = slice(first, first := first + number)
+        torch.testing.assert_close(means / sizes[:, None], found.clusters.means[own])
+    assert first == len(found.clusters)
+
+
 def test_where_all_clusters_are_small_one_remains():
-    merged = merge_small(cluster_moments(torch.randn(3, 2), torch.arange(3), 3))
+    merged, _ = merge_small(cluster_moments(torch.randn(3, 2), torch.arange(3), 3))
     assert merged.counts.tolist() == [3]
 
 

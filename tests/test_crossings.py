@@ -6,7 +6,15 @@ from native_maps import dims
 from torch import Tensor
 
 from lardhm_torch import LardHilbertMap, Scans, native, raycast, sample_rays
-from lardhm_torch.native.crossings import PATCH_HITS, Lines, Passages, balanced_order, passages
+from lardhm_torch.native.crossings import (
+    PATCH_HITS,
+    Lines,
+    Passages,
+    balanced_order,
+    find_patches,
+    passages,
+    roughness,
+)
 from lardhm_torch.sampling import SamplingConfig
 
 F64 = torch.float64
@@ -43,6 +51,33 @@ def test_rays_through_a_hole_pass_the_plane_of_the_wall_and_others_do_not():
     assert (found.widths[wall] < 0.1).all()
     assert through[found.rays].all()
     assert set(through.nonzero()[:, 0].tolist()) == set(found.rays[wall].tolist())
+
+
+def rough_room(scale: float, noise: float = 0.01, scans: int = 2) -> Scans:
+    """Floor and wall of a room of 10 m, 20,000 hits that scatter by so much, in another unit."""
+    rng = torch.Generator().manual_seed(2)
+    ends = 10 * torch.rand(20_000, 3, generator=rng, dtype=F64)
+    ends[::2, 2], ends[1::2, 0] = 0, 10
+    ends += noise * torch.randn(ends.shape, generator=rng, dtype=F64)
+    starts = torch.tensor([[5.0, 5, 2], [4, 6, 2]], dtype=F64)[:scans]
+    return Scans(scale * starts, scale * ends, torch.arange(len(ends)) % scans)
+
+
+@pytest.mark.parametrize("scale", [1, 10, 0.1])
+def test_hits_scatter_by_the_noise_of_the_sensor_in_any_unit(scale):
+    found = roughness(find_patches(rough_room(scale).ends))
+    assert 0.005 * scale < found < 0.01 * scale
+
+
+@pytest.mark.parametrize("scale", [10, 0.1])
+def test_units_are_named_where_hits_scatter_too_much_or_too_little(scale):
+    with pytest.warns(UserWarning, match=r"scatter by .* must be in meters"):
+        sample_rays(rough_room(scale))
+
+
+def test_no_unit_is_named_in_meters_in_a_simulation_or_for_one_precise_scan():
+    for scans in (rough_room(1), rough_room(1, noise=0), rough_room(0.1, scans=1)):
+        sample_rays(scans)
 
 
 def test_rays_that_end_on_a_noisy_floor_do_not_pass_through_it():

@@ -46,18 +46,27 @@ def test_kept_points_and_their_number(both, dtype, dim):
     assert torch.equal(counts, plain)
     assert torch.equal(counts, owners.bincount(minlength=CLUSTERS).clamp(max=EVIDENCE))
     for rows in (None, torch.tensor([8, 3, 7, 3])):
-        fast, slow = both(evidence.kept_points, found, rows)
-        assert all(torch.equal(a, b) for a, b in zip(fast, slow, strict=True))
+        for most in (None, torch.arange(CLUSTERS) % 40):
+            fast, slow = both(evidence.kept_points, found, rows, most)
+            assert all(torch.equal(a, b) for a, b in zip(fast, slow, strict=True))
 
 
 @dims
 @dtypes
-def test_points_that_are_kept_already_are_counted(both, dtype, dim):
+def test_points_that_are_kept_already_and_those_that_can_be(both, dtype, dim):
     points, owners, found = kept(dim, dtype)
-    again, plain = both(evidence.kept_again, points, owners, found)
-    assert torch.equal(again, plain)
-    assert torch.equal(again, evidence.kept_counts(found))
-    assert evidence.kept_again(points + 1, owners, found).sum() == 0
+    cleared = torch.arange(CLUSTERS + 1) % 5 == 0
+    owners[1:4] = torch.tensor([-1, CLUSTERS, 8])  # no cluster, a new one, and one without points
+    fast, plain = both(evidence.kept_again, points, owners, found, cleared)
+    assert all(torch.equal(a, b) for a, b in zip(fast, plain, strict=True))
+    again, enters = fast
+    assert (again.sum() > 0) and enters[1:4].tolist() == [False, True, True]
+    others = points + 1
+    again, enters = evidence.kept_again(others, owners, found, cleared)
+    assert again.sum() == 0 and 0 < enters.sum() < len(enters)
+    after, _ = evidence.add_points(found, cleared, others, owners)
+    chosen = [evidence.add_points(found, cleared, others[enters], owners[enters])[0], after]
+    assert torch.equal(*chosen)
 
 
 @dims
@@ -154,9 +163,11 @@ def test_losses_in_excess_of_a_perfect_prediction(ops, monkeypatch, dtype):
     values = torch.rand(500, 5, generator=rng, dtype=dtype)
     labels = (torch.arange(500) % 5 / 4).to(dtype)
     weights = 9 * torch.randn(30, generator=rng, dtype=dtype)
-    fast = excess_losses(indices, values, labels, weights)
+    fast = excess_losses(indices, values, labels, weights, 3)
     monkeypatch.setattr(native, "descends", lambda *_: False)
-    torch.testing.assert_close(fast, excess_losses(indices, values, labels, weights))
+    slow = excess_losses(indices, values, labels, weights, 3)
+    torch.testing.assert_close(fast, slow)
+    assert torch.equal(slow, excess_losses(indices, values, labels, weights)[::3])
     assert bool((fast > -1e-6).all())
     assert fast.max() > 1
 
@@ -167,7 +178,7 @@ def test_opcheck_accepts_the_operators_of_kept_points(ops):
     torch.library.opcheck(ops.add_points.default, (found, cleared, points, owners.int()))
     torch.library.opcheck(ops.halves.default, (found,))
     indices, values = torch.zeros(4, 2, dtype=torch.int32), torch.ones(4, 2)
-    torch.library.opcheck(ops.excess_losses.default, (indices, values, values[:, 0], values[0]))
+    torch.library.opcheck(ops.excess_losses.default, (indices, values, values[:, 0], values[0], 2))
 
 
 @dims

@@ -11,7 +11,7 @@ from native_maps import (
 )
 
 from lardhm_torch import native
-from lardhm_torch.learning.clustering import mini_batch_kmeans
+from lardhm_torch.learning.kmeans import mini_batch_kmeans
 from lardhm_torch.learning.points import morton_order
 
 
@@ -72,3 +72,18 @@ def test_rows_that_are_not_there_are_refused(ops):
     for rows in (torch.tensor([3, 20]), torch.tensor([-1])):
         with pytest.raises(RuntimeError, match="row out of range"):
             ops.kmeans(points, start, rows, 1, 5)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_axes_of_symmetric_matrices_are_those_of_torch(dim, dtype):
+    rows = torch.randn(500, dim, dim, generator=torch.Generator().manual_seed(dim), dtype=dtype)
+    rows[:100, :, 0] = 0  # singular
+    rows[100:200] = torch.eye(dim, dtype=dtype)
+    matrices = rows @ rows.mT
+    values, axes = native.symmetric_axes(matrices)
+    close = {"rtol": 1e-4, "atol": 1e-5} if dtype == torch.float32 else {}
+    torch.testing.assert_close(values, torch.linalg.eigvalsh(matrices), **close)
+    torch.testing.assert_close((axes * values[:, None]) @ axes.mT, matrices, **close)
+    torch.testing.assert_close(axes.mT @ axes, torch.eye(dim, dtype=dtype).expand_as(axes), **close)
+    assert len(native.symmetric_axes(matrices[:0])[0]) == 0

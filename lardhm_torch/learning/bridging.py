@@ -18,6 +18,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.learning.clustering import points_where
 from lardhm_torch.learning.map_state import MapState, factor_covariances
+from lardhm_torch.native.crossings import PRIMES
 from lardhm_torch.sampling import UNKNOWN
 
 PATCH = 5  # nearest clusters that define the plane of a cluster ...
@@ -32,6 +33,7 @@ MOST = 64  # points in a gap
 CLEAR = (
     0.2  # [m] a free or unknown point in the plane, closer than this to a probe, keeps a gap open
 )
+CELL_BITS = 20  # of the table in `close_points`
 PROBES = (0.25, 0.5, 0.75)  # places between the centers where such points are sought
 
 
@@ -108,12 +110,14 @@ def find_plates(surfaces: MapState, floor: float) -> Plates:
     offsets = offsets - (fractions[:, :, None] * offsets).sum(dim=1, keepdim=True)
     around = covariances[near] + offsets[:, :, :, None] * offsets[:, :, None]
     around = (fractions[:, :, None, None] * around).sum(dim=1)
-    variances, directions = torch.linalg.eigh(around)
+    variances, directions = native.symmetric_axes(around)
     normals = directions[:, :, 0]
     across = normals[:, :, None] * normals[:, None]  # (M, D, D)
     eye = torch.eye(centers.shape[1]).to(centers)
     inside = (eye - across) @ covariances @ (eye - across)
-    spread, axes = torch.linalg.eigh(inside - across)  # the normal has the only negative eigenvalue
+    spread, axes = native.symmetric_axes(
+        inside - across
+    )  # the normal has the only negative eigenvalue
     spread[:, 0] = (normals[:, None] @ covariances @ normals[:, :, None]).flatten()
     extents = (spread.clamp(min=0) + floor**2).sqrt()
     patch = (variances.clamp(min=0) + floor**2).sqrt()
@@ -128,14 +132,15 @@ def find_gaps(plates: Plates) -> Gaps:
     the distance from the plane of the other.
     """
     centers, axes, extents, _, is_flat = plates
-    near = native.nearest_centers(centers, centers, min(CANDIDATES + 1, len(centers)))
-    offsets = centers[near] - centers[:, None]  # (M, K, D)
+    rows = is_flat.nonzero().squeeze(1)
+    near = native.nearest_centers(centers[rows], centers, min(CANDIDATES + 1, len(centers)))
+    offsets = centers[near] - centers[rows, None]  # (F, K, D)
     lengths = torch.linalg.vector_norm(offsets, dim=2)
-    along = offsets @ axes
+    along = offsets @ axes[rows]
     height = (offsets * plates.normals[near]).sum(dim=2).abs().maximum(along[:, :, 0].abs())
     thickness = extents[:, 0]
-    level = height < thickness[near].maximum(thickness[:, None]) + SLOPE * lengths
-    fits = level & is_flat[:, None] & is_flat[near] & (lengths > 0) & (lengths < FARTHEST)
+    level = height < thickness[near].maximum(thickness[rows, None]) + SLOPE * lengths
+    fits = level & is_flat[near] & (lengths > 0) & (lengths < FARTHEST)
     found = []
     for column in range(1, centers.shape[1]):
         for sign in (1, -1):
@@ -143,7 +148,7 @@ def find_gaps(plates: Plates) -> Gaps:
             nearest, place = torch.where(ahead, lengths, torch.inf).min(dim=1)
             first = nearest.isfinite().nonzero().squeeze(1)
             second = near[first, place[first]]
-            found.append((first, second, torch.full_like(first, column), nearest[first]))
+            found.append((rows[first], second, torch.full_like(first, column), nearest[first]))
     first, second, axis, lengths = map(torch.cat, zip(*found, strict=True))
     ways = (centers[second] - centers[first]) / lengths[:, None]
     ends = [_extent(plates, owner, ways) for owner in (first, second)]
@@ -166,19 +171,44 @@ def is_open(gaps: Gaps, plates: Plates, others: Tensor) -> Tensor:
         plates: M clusters.
         others: (F, D) free and unknown points [m].
     """
-    found = torch.zeros_like(gaps.first, dtype=torch.bool)
-    if len(others) == 0:
-        return found
+    if len(gaps.first) == 0:
+        return torch.zeros_like(gaps.first, dtype=torch.bool)
     begin, normal = plates.centers[gaps.first], plates.normals[gaps.first]
     way = plates.centers[gaps.second] - begin
     thickness = plates.extents[gaps.first, 0].maximum(plates.extents[gaps.second, 0])
-    for place in PROBES:
-        probes = begin + place * way
-        offsets = others[native.nearest_centers(probes, others, 4)] - probes[:, None]
-        height = (offsets * normal[:, None]).sum(dim=2).abs()
-        aside = (offsets.square().sum(dim=2) - height.square()).clamp(min=0).sqrt()
-        found |= ((height < thickness[:, None]) & (aside < CLEAR)).any(dim=1)
-    return found
+    places = way.new_tensor(PROBES)[:, None, None]
+    probes = begin + places * way  # (3, P, D)
+    farthest = float((thickness.square() + CLEAR**2).max().sqrt())
+    others = close_points(others, probes.flatten(0, 1), farthest)
+    if len(others) == 0:
+        return torch.zeros_like(gaps.first, dtype=torch.bool)
+    near = native.nearest_centers(probes.flatten(0, 1), others, 4)
+    offsets = others[near].unflatten(0, probes.shape[:2]) - probes[:, :, None]
+    height = (offsets * normal[:, None]).sum(dim=3).abs()
+    aside = (offsets.square().sum(dim=3) - height.square()).clamp(min=0).sqrt()
+    inside = (height < thickness[:, None]) & (aside < CLEAR)
+    return inside.any(dim=2).any(dim=0)
+
+
+def close_points(points: Tensor, places: Tensor, radius: float) -> Tensor:
+    """Those of (N, D) points that may be closer than ``radius`` to one of (P, D) places, and some more.
+
+    A hash of cells finds them in much less time than a search.
+    """
+    edge, dim = 2 * radius, points.shape[1]
+    corners = torch.cartesian_prod(*[places.new_tensor([-radius, radius])] * dim).view(-1, dim)
+    marked = torch.zeros(1 << CELL_BITS, dtype=torch.bool, device=points.device)
+    marked[cell_entry(places[:, None] + corners, edge)] = True
+    return points_where(points, marked[cell_entry(points, edge)])
+
+
+def cell_entry(points: Tensor, edge: float) -> Tensor:
+    """(..., D) positions -> (...) entry of each point's cell in a table of 2^`CELL_BITS`, int64."""
+    cells = (points / edge).floor_()
+    entry = cells[..., 0].long() * PRIMES[0]
+    for axis in range(1, points.shape[-1]):
+        entry ^= cells[..., axis].long() * PRIMES[axis % len(PRIMES)]
+    return entry.bitwise_and_((1 << CELL_BITS) - 1)
 
 
 def stretched_factors(gaps: Gaps, plates: Plates) -> tuple[Tensor, Tensor]:

@@ -9,24 +9,23 @@ from __future__ import annotations
 import numbers
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lardhm_torch import native
-from lardhm_torch.learning.points import at_most, count_cells, morton_order
+from lardhm_torch.learning.kmeans import ITERATIONS, mini_batch_kmeans
+from lardhm_torch.learning.points import count_cells, morton_order
 from lardhm_torch.native import nearest_centers
-from lardhm_torch.sampling import spread_rows
 
 POINTS_PER_CLUSTER = 15  # minimum mean number of points per cluster in `choose_num_clusters`
 DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the noise
 CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] grid cells, and occupied cells per cluster
 CELLS_PER_SCAN_CLUSTER = 1  # the same in `scan_clusters`
 MAX_CHOSEN = 5000  # upper bound per class in `choose_num_clusters`
-START_POINTS = 50  # number of random points per center from which initial centers are chosen
-ITERATIONS = 20  # of k-means; t in Algorithm 1
-VOLUME_ITERATIONS = 5  # the same for free and unknown points, if there are unknown points
+FIT_ITERATIONS = 15  # of k-means, of occupied points
+VOLUME_ITERATIONS = 5  # the same of free and unknown points, if there are unknown points
 FEW_POINTS = 64  # classes up to this size may have one cluster per point
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
@@ -78,14 +77,25 @@ def cluster_points(
 
     Source: Guizilini & Ramos 2016, Algorithm 1, eq. (6), (7) and Section IV-B.
     """
+    return grouped_points(points, num_clusters, rng, iterations)[0]
+
+
+def grouped_points(
+    points: Tensor, num_clusters: int, rng: torch.Generator, iterations: int = ITERATIONS
+) -> tuple[Clusters, Tensor]:
+    """The clusters of `cluster_points`, and (N,) int32 the cluster of each point."""
     num_clusters = max(1, min(num_clusters, most_clusters(len(points))))
     centers = mini_batch_kmeans(points, num_clusters, rng, iterations=iterations)
-    _, counts, sums, scatters = native.assign(points, centers)
+    labels, counts, sums, scatters = native.assign(points, centers)
     min_count = min(MIN_COUNT, max(1, len(points) // num_clusters))
-    clusters = merge_small(clusters_from_moments(centers, counts, sums, scatters), min_count)
+    clusters = clusters_from_moments(centers, counts, sums, scatters)
+    clusters, groups = merge_small(clusters, min_count)
     # Clusters that are close in space are close in memory, so queries of large maps are faster.
     order = morton_order(clusters.means)
-    return Clusters(*(moments[order] for moments in clusters))
+    place = torch.empty_like(order, dtype=torch.int32)
+    place[order] = torch.arange(len(order), dtype=torch.int32, device=order.device)
+    owners = place[groups].index_select(0, labels)
+    return Clusters(*(moments[order] for moments in clusters)), owners
 
 
 def most_clusters(num_points: int) -> int:
@@ -116,6 +126,26 @@ def cluster_classes(
     Returns:
         M clusters, occupied ones first, and an (M,) bool mask of the occupied ones.
     """
+    return group_classes(points, labels, num_clusters, rng)[:2]
+
+
+class Grouped(NamedTuple):
+    """Clusters of the points of several classes."""
+
+    clusters: Clusters  # M clusters, those of the occupied points first
+    is_occupied: Tensor  # (M,) bool
+    classes: list[Tensor]  # (N, D) points of each class
+    owners: list[Tensor]  # (N,) int32 their clusters, among those of the class
+    numbers: list[int]  # of clusters of each class
+
+
+def group_classes(
+    points: Tensor,
+    labels: Tensor,
+    num_clusters: int | Sequence[int] | None,
+    rng: torch.Generator,
+) -> Grouped:
+    """The clusters of `cluster_classes`, and which points belong to each."""
     classes = split_labels(points, labels)
     if num_clusters is None:
         chosen = choose_num_clusters(next(members for members in classes if len(members)))
@@ -136,10 +166,8 @@ def class_ratios(num_unknown: int) -> tuple[int, int, int]:
     return (1, 2, 1) if num_unknown else (1, 1, 0)
 
 
-def cluster_each(
-    classes: list[Tensor], totals: Sequence[int], rng: torch.Generator
-) -> tuple[Clusters, Tensor]:
-    """Cluster each class; returns M clusters in that order and an (M,) bool mask of occupied ones.
+def cluster_each(classes: list[Tensor], totals: Sequence[int], rng: torch.Generator) -> Grouped:
+    """Cluster each class.
 
     Args:
         classes: (N, D) occupied, (F, D) free and, if given, (U, D) unknown positions [m], in the
@@ -148,16 +176,20 @@ def cluster_each(
         rng: random generator.
     """
     with_unknown = len(classes) > 2 and len(classes[2]) > 0
-    rest = VOLUME_ITERATIONS if with_unknown else ITERATIONS
-    parts = []
-    for number, (members, total) in enumerate(zip(classes, totals, strict=True)):
+    rest = VOLUME_ITERATIONS if with_unknown else FIT_ITERATIONS
+    parts, owners, numbers = [], [], []
+    for kind, (members, total) in enumerate(zip(classes, totals, strict=True)):
+        numbers.append(0)
+        owners.append(torch.full_like(members[:, 0], -1, dtype=torch.int32))
         if len(members) and total:
-            found = cluster_points(members, total, rng, rest if number else ITERATIONS)
-            parts.append(unknown_clusters(found) if number == 2 else found)
+            iterations = rest if kind else FIT_ITERATIONS
+            found, owners[kind] = grouped_points(members, total, rng, iterations)
+            numbers[kind] = len(found)
+            parts.append(unknown_clusters(found) if kind == 2 else found)
     clusters = concatenate_clusters(parts)
     is_occupied = torch.zeros_like(clusters.counts, dtype=torch.bool)
-    is_occupied[: len(parts[0]) if len(classes[0]) else 0] = True
-    return clusters, is_occupied
+    is_occupied[: numbers[0]] = True
+    return Grouped(clusters, is_occupied, classes, owners, numbers)
 
 
 def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
@@ -170,10 +202,9 @@ def split_classes(points: Tensor, is_occupied: Tensor) -> list[Tensor]:
 
 def split_labels(points: Tensor, labels: Tensor) -> list[Tensor]:
     """Occupied, free and unknown points (labels 1, 0 and 1/2)."""
-    occupied, rest = split_classes(points, labels > 0.5)
     if bool((labels != 0.5).all()):
-        return [occupied, rest, rest[:0]]
-    return [occupied, points_where(points, labels < 0.5), points_where(points, labels == 0.5)]
+        return [*split_classes(points, labels > 0.5), points[:0]]
+    return [points_where(points, labels == label) for label in (1, 0, 0.5)]
 
 
 def unknown_clusters(clusters: Clusters) -> Clusters:
@@ -260,76 +291,6 @@ def check_num_clusters(num_clusters: int | None) -> None:
         )
 
 
-def mini_batch_kmeans(
-    points: Tensor,
-    num_clusters: int,
-    rng: torch.Generator,
-    *,
-    iterations: int = ITERATIONS,
-    batch_size: int | None = None,
-    restart_every: int = 5,
-) -> Tensor:
-    """Mini-batch k-means: centers with a small mean squared distance to the points.
-
-    Each center is the running mean of the batch points assigned to it: a point moves its nearest
-    center by the offset divided by the number of points assigned so far. There are two departures
-    from Algorithm 1, each of which lowers the inertia by several percent: initial centers and batches
-    are stratified samples in Morton order, and the counts are reset every ``restart_every``
-    iterations, so that points assigned to an earlier position of a center are discarded.
-
-    Args:
-        points: (N, D) positions [m], in the order of `morton_order`; in any other order the
-            result is valid, but less accurate.
-        num_clusters: number of centers, at most N.
-        rng: random generator of the initial centers and of the batches.
-        iterations: t in Algorithm 1.
-        batch_size: b in Algorithm 1; None: 10 points per center.
-        restart_every: number of iterations between resets of the counts.
-
-    Returns:
-        (num_clusters, D) centers [m].
-
-    Source: Guizilini & Ramos 2016, Algorithm 1.
-    """
-    batch_size = min(len(points), batch_size or 10 * num_clusters)
-    centers = _stratified_start(points, num_clusters, rng)
-    rows = spread_rows(len(points), batch_size, rng, iterations)
-    if native.supports(points):
-        return torch.ops.lardhm.kmeans(points, centers, rows, batch_size, restart_every)
-    counts = torch.zeros(num_clusters, dtype=points.dtype, device=points.device)
-    for iteration in range(iterations):
-        if iteration % restart_every == 0:
-            counts.zero_()
-        batch = points[rows[iteration]]
-        labels = nearest_centers(batch, centers, 1).squeeze(1)
-        shifts = torch.zeros_like(centers).index_add_(0, labels, batch - centers[labels])
-        counts += torch.bincount(labels, minlength=num_clusters)
-        centers = centers + shifts / counts.clamp(min=1)[:, None]
-    return centers
-
-
-def _stratified_start(points: Tensor, num_clusters: int, rng: torch.Generator) -> Tensor:
-    """Initial centers: stratified random points, with strata of equal length along the Morton order.
-
-    The length of a step is the distance [m] between points that are a quarter of a cluster size
-    apart in the order, so sparse regions receive more centers than in proportion to their points.
-    The inertia is smallest for a density of centers between that of the points and a uniform one.
-    """
-    count = START_POINTS * num_clusters
-    ordered = at_most(points, count, rng)
-    if num_clusters >= len(ordered):
-        return ordered
-    lag = max(1, len(ordered) // (4 * num_clusters))
-    gaps = torch.linalg.vector_norm(ordered[lag:] - ordered[:-lag], dim=1)
-    ahead = torch.cat([gaps, gaps[-1:].expand(lag)])
-    behind = torch.cat([gaps[:1].expand(lag), gaps])
-    weight = torch.minimum(ahead, behind).double()
-    along = (weight + 1e-6 * weight.mean() + 1e-300).cumsum(0)
-    position = torch.rand(num_clusters, generator=rng, device=rng.device, dtype=torch.double)
-    place = (torch.arange(num_clusters, device=rng.device) + position) / num_clusters * along[-1]
-    return ordered[torch.searchsorted(along, place).clamp(max=len(ordered) - 1)]
-
-
 def clusters_from_moments(
     centers: Tensor, counts: Tensor, sums: Tensor, scatters: Tensor
 ) -> Clusters:
@@ -374,16 +335,19 @@ def pool_clusters(clusters: Clusters, groups: Tensor, num_groups: int) -> Cluste
     return Clusters(counts, means, scatters)
 
 
-def merge_small(clusters: Clusters, min_count: int = MIN_COUNT) -> Clusters:
+def merge_small(clusters: Clusters, min_count: int = MIN_COUNT) -> tuple[Clusters, Tensor]:
     """Merge clusters of fewer than ``min_count`` points into their nearest large neighbor.
 
     Empty clusters are removed. If all clusters are small, they are merged into the largest.
+
+    Returns:
+        The clusters that are left, and (M,) which of them each given one belongs to.
 
     Source: Guizilini & Ramos 2016, Section IV-B.
     """
     large = clusters.counts >= min_count
     if bool(large.all()):
-        return clusters
+        return clusters, torch.arange(len(clusters), device=large.device)
     if not bool(large.any()):
         large[clusters.counts.argmax()] = True
     kept = large.nonzero().squeeze(1)
@@ -391,4 +355,4 @@ def merge_small(clusters: Clusters, min_count: int = MIN_COUNT) -> Clusters:
     groups[kept] = torch.arange(len(kept), device=kept.device)
     small = (~large).nonzero().squeeze(1)
     groups[small] = nearest_centers(clusters.means[small], clusters.means[kept], 1).squeeze(1)
-    return pool_clusters(clusters, groups, len(kept))
+    return pool_clusters(clusters, groups, len(kept)), groups

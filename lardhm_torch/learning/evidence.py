@@ -18,14 +18,11 @@ from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.cluster_matching import moved_factors
 from lardhm_torch.learning.clustering import (
     Clusters,
+    Grouped,
     clusters_from_moments,
-    split_labels,
 )
 from lardhm_torch.learning.map_state import EVIDENCE, MapState, factor_covariances
-from lardhm_torch.learning.points import at_most
 from lardhm_torch.native.thinning import BITS, priorities
-
-SAMPLE_FACTOR = 2  # points of a fit from which evidence is chosen, relative to the evidence
 
 
 def keep_points(points: Tensor, owners: Tensor, num_clusters: int) -> Tensor:
@@ -87,6 +84,11 @@ def add_points(
     return after, (~again & ~after[:, :, 0].isinf()).sum(dim=1)
 
 
+def keeps_points(evidence: Tensor) -> Tensor:
+    """(M, E, D) evidence -> (M,) bool, whether a cluster keeps any point."""
+    return ~evidence[:, 0, 0].isinf()
+
+
 def kept_counts(evidence: Tensor) -> Tensor:
     """(M, E, D) evidence -> (M,) number of kept points."""
     if _is_native(evidence):
@@ -94,12 +96,15 @@ def kept_counts(evidence: Tensor) -> Tensor:
     return (~evidence[:, :, 0].isinf()).sum(dim=1)
 
 
-def kept_points(evidence: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def kept_points(
+    evidence: Tensor, rows: Tensor | None = None, most: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """The points that some clusters keep.
 
     Args:
         evidence: (M, E, D).
         rows: (Q,) clusters; None: all.
+        most: (M,) int64 maximum number of points of each cluster, the first ones; None: no limit.
 
     Returns:
         (L, D) points, in the order of ``rows``, and (L,) the cluster of each.
@@ -107,26 +112,38 @@ def kept_points(evidence: Tensor, rows: Tensor | None = None) -> tuple[Tensor, T
     if rows is None:
         rows = torch.arange(len(evidence), device=evidence.device)
     if _is_native(evidence):
-        return torch.ops.lardhm.kept_points(evidence, rows)
-    found = evidence[rows]
+        return torch.ops.lardhm.kept_points(evidence, rows, rows[:0] if most is None else most)
+    found = evidence[rows] if most is None else first_points(evidence[rows], most[rows])
     mask = ~found[:, :, 0].isinf()
     return found[mask], rows[mask.nonzero()[:, 0]]
 
 
-def kept_again(points: Tensor, owners: Tensor, evidence: Tensor) -> Tensor:
-    """(M,) number of the points of each cluster that it keeps already.
+def kept_again(
+    points: Tensor, owners: Tensor, evidence: Tensor, cleared: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Which points clusters keep already, and which they can keep.
 
     Args:
         points: (N, D) positions [m].
-        owners: (N,) their clusters; points with any other number are left out.
-        evidence: (M, E, D).
+        owners: (N,) their clusters; points with a negative number are left out.
+        evidence: (K, E, D) of the first of M clusters.
+        cleared: (M,) bool, clusters that lose the points that they keep.
+
+    Returns:
+        (M,) number of the points that a cluster keeps already; (N,) bool: False for those, and for
+        points with larger priorities than all points of a cluster that keeps E and loses none.
     """
     if _is_native(evidence):
-        return torch.ops.lardhm.kept_again(points, owners, evidence)
-    inside = (owners >= 0) & (owners < len(evidence))
-    points, owners = points[inside], owners[inside]
-    again = (evidence[owners] == points[:, None]).all(dim=2).any(dim=1)
-    return torch.bincount(owners[again], minlength=len(evidence))
+        return torch.ops.lardhm.kept_again(points, owners, evidence, cleared)
+    enters = owners >= 0
+    rows = (enters & (owners < len(evidence))).nonzero().squeeze(1)
+    points, owners = points[rows], owners[rows]
+    kept = evidence[owners]
+    again = (kept == points[:, None]).all(dim=2).any(dim=1)
+    last = priorities(evidence.flatten(0, 1)).reshape(evidence.shape[:2]).amax(dim=1)[owners]
+    loses = kept[:, -1, 0].isinf() | cleared[owners]
+    enters[rows] = ~again & (loses | (priorities(points) <= last))
+    return torch.bincount(owners[again], minlength=len(cleared)), enters
 
 
 def _is_native(evidence: Tensor) -> bool:
@@ -218,29 +235,10 @@ def halves(evidence: Tensor) -> tuple[Tensor, Tensor]:
     return parts[0], parts[1]
 
 
-def fitted_evidence(
-    points: Tensor, labels: Tensor, state: MapState, rng: torch.Generator
-) -> Tensor:
-    """(M, E, D) evidence of clusters that were fitted to points of their classes.
-
-    It is chosen from a random subset of the points if there are many.
-
-    Args:
-        points: (N, D) positions [m], in the order of `morton_order`.
-        labels: (N,) 1 occupied, 0 free, 1/2 unknown.
-        state: M clusters, at least one of every class of the points.
-        rng: random generator of the subset.
-    """
-    evidence = torch.empty_like(state.evidence)
-    for kind, members in enumerate(split_labels(points, labels)):
-        rows = (state.kinds == kind).nonzero().squeeze(1)
-        if len(rows) == 0:
-            continue
-        count = SAMPLE_FACTOR * EVIDENCE * len(rows)
-        members = at_most(members, count, rng)
-        owners = native.nearest_centers(members, state.means[rows], 1).squeeze(1)
-        evidence[rows] = keep_points(members, owners, len(rows))
-    return evidence
+def fitted_evidence(grouped: Grouped) -> Tensor:
+    """(M, E, D) evidence of clusters that were fitted to points of their classes."""
+    parts = zip(grouped.classes, grouped.owners, grouped.numbers, strict=True)
+    return torch.cat([keep_points(points, owners, number) for points, owners, number in parts])
 
 
 def with_evidence(state: MapState, floor: float, rng: torch.Generator) -> Tensor:
@@ -249,7 +247,7 @@ def with_evidence(state: MapState, floor: float, rng: torch.Generator) -> Tensor
     Clusters have no evidence if the map was saved without it. Points are then drawn uniformly from
     ellipsoids with the means and covariances of the clusters.
     """
-    empty = (kept_counts(state.evidence) == 0).nonzero().squeeze(1)
+    empty = (~keeps_points(state.evidence)).nonzero().squeeze(1)
     if len(empty) == 0:
         return state.evidence
     lost = state.rows(empty)

@@ -12,12 +12,13 @@ from tqdm import tqdm
 
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
+from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.bridging import bridged
-from lardhm_torch.learning.clustering import cluster_classes
+from lardhm_torch.learning.clustering import group_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.points import blurred_hits, check_noise
-from lardhm_torch.learning.unseen import settle_unknown
+from lardhm_torch.learning.unseen import even_kernels, settle_unknown
 
 CHUNK_ROWS = 1 << 21  # number of points whose features are computed at a time
 PASSES, MIN_STEPS = 4, 256  # small data sets need more passes for enough steps
@@ -120,25 +121,30 @@ def fit_clusters(
 
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
-    clusters, is_occupied = cluster_classes(points, labels, num_clusters, task.rng)
-    state = new_rows(clusters, is_occupied, task.kernel.min_lengthscale)
-    state = replace(state, evidence=fitted_evidence(points, labels, state, task.rng))
+    floor = task.kernel.min_lengthscale
+    grouped = group_classes(points, labels, num_clusters, task.rng)
+    state = even_kernels(new_rows(*grouped[:2], floor, fitted_evidence(grouped)), floor)
     if task.config.bridge_gaps:
         state, points, labels = bridged(state, points, labels, task.kernel, task.rng)
     points, labels = settle_unknown(points, labels, state, task.kernel, task.rng)
     points = blurred_hits(points, labels, task.config.hit_noise, task.rng)
+    order = torch.arange(len(points), device=points.device)
     batch_size = task.config.rows_per_batch(len(points))
-    points, labels = stratified_batches((points, labels), batch_size, task.rng)
+    order, labels = stratified_batches((order, labels), batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def compute(rows: slice) -> tuple[Tensor, Tensor]:
-        centers, factors = state.centers, state.raw_scale_tril
-        return native.nearest_features(points[rows], centers, factors, task.kernel, index)
+        given = (state.centers, state.raw_scale_tril, task.kernel, index)
+        if len(order[rows]) == len(points):
+            return ordered_features(points, order, *given)
+        return native.nearest_features(points[order[rows]], *given)
 
     features_of = _LastFeatures(compute)
     weights = fit_weights(features_of, labels, state.weights, task.config, task.progress)
     state = replace(state, weights=weights)
-    return state if refine is None else refine(state, Batched(points, labels, features_of), task)
+    if refine is None:
+        return state
+    return refine(state, Batched(points[order], labels, features_of), task)
 
 
 class _LastFeatures:

@@ -66,9 +66,9 @@ def forget(known: MapState, before: Tensor) -> MapState:
         known: M clusters.
         before: (M,) doubts before the new scan.
     """
-    kept = kept_counts(known.evidence)
     lost = (known.doubts > GONE) | ((known.kinds == 2) & (known.losses > OVERRULED))
-    changed = trust(known.doubts) != trust(before)
+    rows = (lost | (trust(known.doubts) != trust(before))).nonzero().squeeze(1)
+    kept = kept_counts(known.evidence.index_select(0, rows))
     evidence = known.evidence
     if bool(lost.any()):
         evidence = evidence.index_fill(0, lost.nonzero().squeeze(1), torch.inf)
@@ -76,5 +76,5 @@ def forget(known: MapState, before: Tensor) -> MapState:
         known,
         evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
-        fresh=torch.where(changed | lost, kept.to(known.fresh), known.fresh),
+        fresh=known.fresh.index_copy(0, rows, kept.to(known.fresh)),
     )

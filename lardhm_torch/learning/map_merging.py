@@ -16,7 +16,7 @@ from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.channel_sums import Layout, joint_layout, moved_sums, with_layout
 from lardhm_torch.learning.cluster_matching import match_clusters, moved_factors
 from lardhm_torch.learning.clustering import concatenate_clusters, pool_clusters
-from lardhm_torch.learning.evidence import keep_points, kept_points, with_evidence
+from lardhm_torch.learning.evidence import keep_points, kept_counts, kept_points, with_evidence
 from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.map_state import NEVER, MapState, factor_covariances
 from lardhm_torch.learning.parameters import MapParameters, read_state, write_state
@@ -313,4 +313,4 @@ def _map_samples(
     points, owners = kept_points(state.evidence)
     tensors = (state.centers, state.raw_scale_tril, state.weights, kernel)
     labels = native.occupancy(points, *tensors, probability=True)
-    return points, labels, state.kinds[owners], evidence_weights(state)[owners]
+    return points, labels, state.kinds[owners], evidence_weights(state, kept_counts(state.evidence))[owners]

@@ -18,7 +18,7 @@ CHECK_CHUNK = 1 << 18  # number of labels checked at a time, to limit memory
 OUTLIER_FACTOR = (
     100.0  # outlier threshold, as a multiple of the spread of the middle 98 % of points
 )
-OUTLIER_SAMPLE = 1 << 14  # number of points used to estimate the spread
+OUTLIER_SAMPLE = 1 << 12  # number of points used to estimate the spread
 FRAME_CHUNK = 1 << 14  # number of points converted at a time; a chunk fits into the CPU cache
 
 
@@ -102,8 +102,9 @@ def inliers(points: Tensor, among: Tensor | None = None) -> Tensor:
     if not bool(limit > 0):
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     low, high = (middle - limit).to(points), (middle + limit).to(points)
-    lower, upper = points.aminmax(dim=0)
-    if bool((lower >= low).all()) and bool((upper <= high).all()):  # the common case
+    ends = [column.aminmax() for column in points.T]  # twice as fast as all columns at once
+    inside = [(end.min >= low[axis]) & (end.max <= high[axis]) for axis, end in enumerate(ends)]
+    if bool(torch.stack(inside).all()):  # the common case
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     return ((points >= low) & (points <= high)).all(dim=1)
 

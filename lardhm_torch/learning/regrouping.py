@@ -22,6 +22,7 @@ from lardhm_torch.learning.clustering import (
     choose_num_clusters,
     cluster_points,
     most_clusters,
+    points_where,
 )
 from lardhm_torch.learning.evidence import (
     add_points,
@@ -38,9 +39,7 @@ from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
-MANY = (
-    0.25  # new points relative to the kept ones, above which the points of a cluster are regrouped
-)
+MANY = 1.0  # new points relative to the kept ones, above which a cluster's points are regrouped
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 
@@ -69,19 +68,16 @@ class Groups(NamedTuple):
     Args:
         state: M clusters without evidence.
         evidence: (K, E, D) the points of the first ones; new clusters, the last ones, have none yet.
+        sizes: (M,) number of points of each cluster.
         kinds: (M,) class, see `MapState.kinds`.
         changed: (M,) bool: the points go to the nearest centers.
     """
 
     state: MapState
     evidence: Tensor
+    sizes: Tensor
     kinds: Tensor
     changed: Tensor
-
-    @property
-    def sizes(self) -> Tensor:
-        """(M,) number of points of each cluster."""
-        return _padded(kept_counts(self.evidence), len(self.kinds))
 
     def rows(self, kind: int) -> Tensor:
         """Rows of the clusters of a class."""
@@ -106,20 +102,19 @@ def regrouped(
     before = len(groups.kinds)
     groups, owners = _joined(groups, classes, rule, rng)
     points, joined = torch.cat(classes), torch.cat(owners)
-    points, joined = points[joined >= 0], joined[joined >= 0]
-    received = torch.bincount(joined, minlength=len(groups.kinds))
+    received = torch.bincount(joined + 1, minlength=len(groups.kinds) + 1)[1:]
     alive = _kept(groups, received, before, rule)
     many = received > MANY * groups.sizes
     groups = groups._replace(changed=groups.changed | many | ~alive)
-    counts = groups.state.counts + _unseen(groups, points, joined, received)
+    again, enters = kept_again(points, joined, groups.evidence, groups.changed)
+    counts = groups.state.counts + _unseen(groups, received, again)
     state = replace(groups.state, counts=torch.where(groups.kinds < 2, counts, 0))
     state = replace(state, scatters=_rescaled(groups.state, state.counts))
-    return _reassigned(groups._replace(state=state), points, joined, alive, len(known), rule.floor)
-
-
-def _padded(counts: Tensor, size: int) -> Tensor:
-    """Counts of the first clusters, followed by zeros for others: (size,)."""
-    return torch.nn.functional.pad(counts, (0, size - len(counts)))
+    sizes = [len(part) for part in classes]
+    entering = [
+        points_where(part, mask) for part, mask in zip(classes, enters.split(sizes), strict=True)
+    ]
+    return _reassigned(groups._replace(state=state), entering, alive, len(known), rule.floor)
 
 
 def _divide(known: MapState, rule: Rule) -> Groups:
@@ -127,7 +122,8 @@ def _divide(known: MapState, rule: Rule) -> Groups:
     kinds, light = known.kinds, replace(known, evidence=known.evidence[:, :0])
     divided = torch.zeros_like(known.is_occupied)
     losses = known.losses * trust(known.doubts)
-    large = (losses > rule.split_loss) & (kept_counts(known.evidence) >= SPLIT)
+    kept = kept_counts(known.evidence)
+    large = (losses > rule.split_loss) & (kept >= SPLIT)
     rows, occupied = [], rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = (kinds == kind).nonzero().squeeze(1)
@@ -139,12 +135,13 @@ def _divide(known: MapState, rule: Rule) -> Groups:
         rows.append(found)
     chosen = torch.cat(rows)
     if len(chosen) == 0:
-        return Groups(light, known.evidence, kinds, divided)
+        return Groups(light, known.evidence, kept, kinds, divided)
     first, second = halves(known.evidence.index_select(0, chosen))
     sizes = torch.stack([kept_counts(first), kept_counts(second)])
     balanced = (sizes.amin(dim=0) >= MIN_COUNT).nonzero().squeeze(1)
     chosen, first, second = chosen[balanced], first[balanced], second[balanced]
-    parents, shares = light.rows(chosen), (sizes / sizes.sum(dim=0))[:, balanced]
+    sizes = sizes[:, balanced]
+    parents, shares = light.rows(chosen), sizes / sizes.sum(dim=0)
     of_parents = kinds[chosen]
     parts = [
         _half(parents, of_parents, evidence, share, rule)
@@ -153,7 +150,8 @@ def _divide(known: MapState, rule: Rule) -> Groups:
     both = MapState(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
     evidence = torch.cat([known.evidence, second]).index_copy_(0, chosen, first)
     divided = torch.cat([divided.index_fill(0, chosen, True), divided.new_ones(len(chosen))])
-    return Groups(light.put(chosen, both), evidence, torch.cat([kinds, of_parents]), divided)
+    kept = torch.cat([kept, sizes[1]]).index_copy_(0, chosen, sizes[0])
+    return Groups(light.put(chosen, both), evidence, kept, torch.cat([kinds, of_parents]), divided)
 
 
 def _half(
@@ -198,10 +196,10 @@ def _joined(
     start = len(groups.kinds)
     for kind, points in enumerate(classes):
         rows = groups.rows(kind)
-        near = Clusters(*(moments[rows] for moments in groups.state.clusters))
+        near = Clusters(*(moments.index_select(0, rows) for moments in groups.state.clusters))
         own = nearest_clusters(points, near, rule.floor, JOIN_STDS)
         far = (own < 0).nonzero().squeeze(1)
-        joined = rows[own.clamp(min=0)] if len(rows) else own
+        joined = rows.index_select(0, own.clamp(min=0)) if len(rows) else own
         if len(far) >= MIN_COUNT or (len(far) and (rule.few or len(rows) == 0)):
             rest = points[far]
             new = _new_clusters(rest, kind, rule, rng)
@@ -221,6 +219,7 @@ def _joined(
     return Groups(
         state,
         groups.evidence,
+        torch.nn.functional.pad(groups.sizes, (0, count)),
         torch.cat([groups.kinds, *kinds]),
         torch.cat([groups.changed, groups.changed.new_ones(count)]),
     ), owners
@@ -269,31 +268,30 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     return alive
 
 
-def _unseen(groups: Groups, points: Tensor, owners: Tensor, joined: Tensor) -> Tensor:
+def _unseen(groups: Groups, joined: Tensor, again: Tensor) -> Tensor:
     """(M,) estimated number of the points joined to each cluster that it has not received before.
 
     A cluster that keeps one in r of its points recognizes one in r of those that it receives again.
     """
-    found = _padded(kept_again(points, owners, groups.evidence), len(joined))
     represented = (groups.state.counts / groups.sizes.clamp(min=1)).clamp(min=1)
-    return joined - torch.minimum(joined, (found * represented).round().to(joined))
+    return joined - torch.minimum(joined, (again * represented).round().to(joined))
 
 
 def _reassigned(
-    groups: Groups, points: Tensor, owners: Tensor, alive: Tensor, num_known: int, floor: float
+    groups: Groups, classes: list[Tensor], alive: Tensor, num_known: int, floor: float
 ) -> MapState:
     """Clusters after new points and all points of changed clusters went to the nearest centers."""
     state, evidence, changed = groups.state, groups.evidence, groups.changed
-    moving, homes = kept_points(evidence, changed[: len(evidence)].nonzero().squeeze(1))
-    moving, homes = torch.cat([points, moving]), torch.cat([owners, homes])
-    target = torch.full_like(homes, -1)
-    kinds = groups.kinds[homes]
-    for kind in range(3):
+    points, owners = [evidence[:0, 0]], [torch.empty_like(groups.kinds[:0])]
+    for kind, new in enumerate(classes):
         rows = (alive & (groups.kinds == kind)).nonzero().squeeze(1)
-        own = (kinds == kind).nonzero().squeeze(1)
-        if len(rows) and len(own):
-            target[own] = rows[_nearest(moving[own], state.means[rows])]
-    evidence, new = add_points(evidence, changed, moving, target)
+        if len(rows) == 0:
+            continue
+        regrouped = changed & (groups.kinds == kind)
+        kept, _ = kept_points(evidence, regrouped[: len(evidence)].nonzero().squeeze(1))
+        points.append(torch.cat([new, kept]))
+        owners.append(rows.index_select(0, _nearest(points[-1], state.means[rows])))
+    evidence, new = add_points(evidence, changed, torch.cat(points), torch.cat(owners))
     sizes = kept_counts(evidence)
     lost = (groups.sizes + new - sizes).clamp(min=0)
     fresh = state.fresh + torch.maximum(new, lost).to(state.fresh)

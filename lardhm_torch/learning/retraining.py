@@ -23,9 +23,10 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.sampling import UNKNOWN
 
-FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
+FRESH = 1 / 4  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 256  # clusters that are chosen for training together
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
+BESIDE = 8  # clusters with fixed weights constrain others with so many of their points
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
 
@@ -37,8 +38,8 @@ def retrained(
 
     A cluster has changed if more than `FRESH` of its kept points are new.
 
-    The evidence of the neighbors of those constrains them, too. ``losses`` of all clusters whose
-    evidence was used are updated.
+    Some of the evidence of the neighbors of those constrains them, too. ``losses`` of the trained
+    clusters are updated.
 
     Args:
         state: M clusters.
@@ -47,7 +48,8 @@ def retrained(
         config: passes, rates and regularizer.
         rng: random generator.
     """
-    changed = _stalest(state, limit)
+    kept = kept_counts(state.evidence)
+    changed = _stalest(state, kept, limit)
     if not bool(changed.any()):
         return state
     index = native.build_index(state.centers, kernel.num_neighbors)
@@ -55,20 +57,23 @@ def retrained(
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
-    points, owners = kept_points(state.evidence, rows)
+    used = torch.where(moving, kept, kept.clamp(max=BESIDE))
+    points, owners = kept_points(state.evidence, rows, used)
     sizes = torch.bincount(owners, minlength=len(state))
-    factors = balanced(state.kinds, evidence_weights(state), config, sizes) * trust(state.doubts)
-    labels, factors = KIND_LABELS.to(points)[state.kinds][owners], factors[owners]
+    strength = evidence_weights(state, kept) * (kept / used.clamp(min=1))
+    factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
+    labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
+    factors = factors.index_select(0, owners)
     config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
     weights, (rows, losses) = trained(state, index, (points, labels, factors), task)
-    owners = owners[rows]
+    owners = owners.index_select(0, rows)
     found = torch.bincount(owners, minlength=len(state))
     losses = torch.zeros_like(weights).index_add_(0, owners, losses) / found
     return replace(
         state,
         weights=torch.where(moving, weights, state.weights),
-        losses=torch.where(found > 0, losses, state.losses),
+        losses=torch.where(moving & (found > 0), losses, state.losses),
         fresh=state.fresh.masked_fill(moving, 0),
     )
 
@@ -106,39 +111,47 @@ def trained(
     features = ordered_features(
         points, batched, state.centers, state.raw_scale_tril, task.kernel, index
     )
-    targets = labels[batched]
+    targets = labels.index_select(0, batched)
     weights = fit_weights(
         lambda rows: (features[0][rows], features[1][rows]),
-        targets, state.weights, config, factors=factors[batched],
+        targets, state.weights, config, factors=factors.index_select(0, batched),
     )  # fmt: skip
-    rows = slice(None, None, LOSS_STRIDE)
-    losses = excess_losses(features[0][rows], features[1][rows], targets[rows], weights)
-    return weights, (batched[rows], losses)
+    losses = excess_losses(*features, targets, weights, LOSS_STRIDE)
+    return weights, (batched[::LOSS_STRIDE], losses)
 
 
-def excess_losses(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
-    """(N,) loss of each sample, in excess of that of a perfect prediction.
+def excess_losses(
+    indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor, stride: int = 1
+) -> Tensor:
+    """Loss of every ``stride``-th of N samples, in excess of that of a perfect prediction.
 
     Args:
         indices: (N, K) clusters.
         values: (N, K) kernel values.
         labels: (N,) in [0, 1].
         weights: (M,).
+        stride: 1 for all samples.
     """
     if native.descends(indices, values):
-        return torch.ops.lardhm.excess_losses(indices, values, labels, weights)
+        return torch.ops.lardhm.excess_losses(indices, values, labels, weights, stride)
+    indices, values, labels = (tensor[::stride] for tensor in (indices, values, labels))
     log_odds = (values * weights[indices]).sum(dim=1)
     loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, labels, reduction="none")
     return loss + torch.xlogy(labels, labels) + torch.xlogy(1 - labels, 1 - labels)
 
 
-def _stalest(state: MapState, limit: int) -> Tensor:
+def _stalest(state: MapState, kept: Tensor, limit: int) -> Tensor:
     """(M,) mask of the clusters with the largest fractions of new points, at most ``limit``.
 
     They are chosen in blocks of clusters that are close to each other, because the neighbors of the
     chosen ones are needed, too.
+
+    Args:
+        state: M clusters.
+        kept: (M,) number of their kept points.
+        limit: maximum number.
     """
-    share = state.fresh / kept_counts(state.evidence)
+    share = state.fresh / kept
     changed = share > FRESH
     if int(changed.sum()) <= limit:
         return changed
@@ -158,13 +171,13 @@ def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor)
     return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
 
 
-def evidence_weights(state: MapState) -> Tensor:
+def evidence_weights(state: MapState, kept: Tensor) -> Tensor:
     """(M,) weight of each kept point of a cluster.
 
     A kept point represents count / kept points. Its weight is the square root of that, between one
     weight for each point that was seen and one for each point that is kept.
     """
-    represented = state.counts / kept_counts(state.evidence).clamp(min=1)
+    represented = state.counts / kept.clamp(min=1)
     return represented.clamp(min=1).sqrt().to(state.weights)
 
 

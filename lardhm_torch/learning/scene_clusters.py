@@ -17,7 +17,6 @@ from lardhm_torch import native
 from lardhm_torch.learning.clustering import (
     POINTS_PER_CLUSTER,
     most_clusters,
-    spread_rows,
 )
 from lardhm_torch.learning.fine_tuning import TuneConfig, tuned_table
 from lardhm_torch.learning.fitting import (
@@ -36,7 +35,7 @@ from lardhm_torch.learning.tuning_steps import (
     to_rows,
     tuning_steps,
 )
-from lardhm_torch.sampling import UNKNOWN
+from lardhm_torch.sampling import UNKNOWN, spread_rows
 
 NATS_PER_PARAMETER = 2.8  # summed loss of the coarse map that is worth a parameter
 COARSE_POINTS = 1000  # known points of the scene per cluster of the coarse map ...

@@ -23,9 +23,10 @@ from lardhm_torch.learning.clustering import (
     FEW_POINTS,
     choose_num_clusters,
     cluster_classes,
+    points_where,
     split_labels,
 )
-from lardhm_torch.learning.evidence import kept_counts, kept_points, with_evidence
+from lardhm_torch.learning.evidence import keeps_points, kept_points, with_evidence
 from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.forgetting import doubted, forget
 from lardhm_torch.learning.map_state import MapState
@@ -114,9 +115,10 @@ def updated(
     occupied, grows = _most_occupied(part, classes[0], num_clusters), num_clusters is None
     rule = Rule(occupied, grows, few, config.split_loss, kernel.min_lengthscale)
     part = regrouped(part, classes, rule, rng)
-    alive = kept_counts(part.evidence) > 0
+    alive = keeps_points(part.evidence)
     part = handed_over(part, alive)
-    part = retrained(part.rows(alive), config.max_trained, kernel, config.fit, rng)
+    part = part if bool(alive.all()) else part.rows(alive)
+    part = retrained(part, config.max_trained, kernel, config.fit, rng)
     return _without(nearby, part, alive)
 
 
@@ -162,10 +164,11 @@ def _still_unknown(
     if len(rows) == 0 or len(part) == 0:
         return points, labels
     tensors = (part.centers, part.raw_scale_tril, part.weights, kernel)
-    probability = native.occupancy(points[rows], *tensors, probability=True, index=index)
-    kept = torch.ones_like(labels, dtype=torch.bool)
-    kept[rows] = (probability - UNKNOWN).abs() < UNDECIDED
-    return points[kept], labels[kept]
+    unknown = points.index_select(0, rows)
+    probability = native.occupancy(unknown, *tensors, probability=True, index=index)
+    known = (probability - UNKNOWN).abs() >= UNDECIDED
+    kept = torch.ones_like(labels, dtype=torch.bool).index_fill_(0, rows[known], False)
+    return points_where(points, kept), labels[kept]
 
 
 def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None) -> int:

@@ -203,6 +203,14 @@ def mixture(
     return torch.cat(parts)
 
 
+def symmetric_axes(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, D, D) symmetric matrices -> (M, D) eigenvalues, ascending, and (M, D, D) axes as columns."""
+    if supports(matrices[:, 0]):
+        return torch.ops.lardhm.symmetric_axes(matrices.detach())
+    values, axes = torch.linalg.eigh(matrices)
+    return values, axes
+
+
 def assign(
     points: Tensor, centers: Tensor, *, scatter: bool = True
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -352,8 +360,8 @@ def _register() -> None:
         return torch.empty_like(evidence), torch.empty_like(evidence)
 
     @library.register_fake("lardhm::excess_losses")
-    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
-        return torch.empty_like(labels)
+    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor, stride: int) -> Tensor:
+        return labels.new_empty(-(-labels.shape[0] // stride))
 
     @library.register_fake("lardhm::tuning_steps")
     def _(points: Tensor, indices: Tensor, labels: Tensor, factors: Tensor, start: Tensor,

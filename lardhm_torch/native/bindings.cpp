@@ -118,9 +118,9 @@ Slot box(bool value) { return stable::detail::from(value); }
 Slot box(int64_t value) { return stable::detail::from(value); }
 
 #define LARDHM_SOURCES(USE)                                                                 \
-  USE(cells) USE(descent) USE(evidence) USE(expected_range) USE(faces) USE(gradients)       \
-  USE(kept) USE(kmeans) USE(marching) USE(mixture) USE(passages) USE(pooling) USE(query)    \
-  USE(raycast) USE(ridge) USE(thinning) USE(tuning) USE(update)
+  USE(axes) USE(cells) USE(descent) USE(evidence) USE(expected_range) USE(faces)            \
+  USE(gradients) USE(kept) USE(kmeans) USE(marching) USE(mixture) USE(passages)             \
+  USE(pooling) USE(query) USE(raycast) USE(ridge) USE(thinning) USE(tuning) USE(update)
 
 // Each source that has operators lists them.
 #define LARDHM_DECLARE(source) std::vector<Operator> source##_operators();

@@ -37,6 +37,7 @@ UNITS = (
         "cells",
         "thinning",
         "passages",
+        "axes",
         "marching",
         "ridge",
     ),

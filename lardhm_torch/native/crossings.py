@@ -8,6 +8,7 @@ a few standard deviations of it, from one side of its plane to the other.
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import torch
@@ -21,6 +22,8 @@ PATCH_HITS = 16  # a patch has so many hits, and fewer than twice as many
 NEAR = 2.5  # standard deviations of a patch: nearer rays pass through it
 FLOOR = 0.01  # [m] smallest standard deviation of a patch
 FLAT = 0.3  # thickness of a flat patch, relative to its second largest extent
+ROUGH_PATCHES = 1024  # number of patches from which the scatter of hits is estimated
+ROUGH = (1 / 400, 1 / 30)  # usual scatter, relative to the reach of samples near surfaces
 SLOW = 1e-30  # components of directions that are smaller count as this
 CHUNK_RAYS = 1 << 14  # number of rays that are followed at a time, in plain torch
 
@@ -108,12 +111,52 @@ def find_patches(hits: Tensor) -> Patches:
     scatters.index_add_(0, owners, offsets[:, :, None] * offsets[:, None])
     covariances = scatters / (sizes - 1).clamp(min=1)[:, None, None]
     covariances += FLOOR**2 * torch.eye(dim, dtype=hits.dtype, device=hits.device)
-    variances, axes = torch.linalg.eigh(covariances)
+    variances, axes = native.symmetric_axes(covariances)
     variances = variances.clamp(min=FLOOR**2)
     spread = variances.sqrt()
     precisions = (axes / variances[:, None]) @ axes.mT
     is_flat = spread[:, 0] < FLAT * spread[:, 1]
     return Patches(means, covariances, precisions, axes[:, :, 0], spread[:, 0], is_flat)
+
+
+def roughness(patches: Patches) -> float:
+    """How far hits typically scatter about planes where the scene is flattest [m].
+
+    This is the first quartile of the thickness of flat patches, of which neighbors are pooled until
+    `ROUGH_PATCHES` are left. NaN if there are fewer patches, or hardly a flat one.
+    """
+    if len(patches.means) < ROUGH_PATCHES:
+        return torch.nan
+    means = patches.means.unflatten(0, (ROUGH_PATCHES, -1))
+    offsets = means - means.mean(dim=1, keepdim=True)
+    within = patches.covariances.unflatten(0, (ROUGH_PATCHES, -1)).mean(dim=1)
+    pooled = within + offsets.mT @ offsets / means.shape[1]
+    spread = (native.symmetric_axes(pooled)[0] - FLOOR**2).clamp(min=0).sqrt()
+    flat = spread[:, 0] < FLAT * spread[:, 1]
+    few = int(flat.sum()) < ROUGH_PATCHES // 16
+    return torch.nan if few else float(spread[flat, 0].quantile(0.25))
+
+
+def warn_of_units(patches: Patches, margin: float, one_scan: bool) -> None:
+    """Warn if hits scatter much more or less than the distances of samples from surfaces allow for.
+
+    Registered scans of lidars and depth cameras scatter by 3 to 11 mm. A single scan may scatter less,
+    and exact planes of a simulation do not scatter at all.
+
+    Args:
+        patches: of the hits.
+        margin: distance from surfaces within which free and unknown points are sampled [m].
+        one_scan: whether all hits were seen from one place.
+    """
+    found = roughness(patches)
+    low, high = (factor * margin for factor in ROUGH)
+    if found > high or (not one_scan and 1e-2 * low < found < low):
+        warnings.warn(
+            f"hits scatter by {found:.2g} m about planes; {low:.2g} to {high:.2g} m are usual. "
+            "Coordinates must be in meters: scale points and sensor positions. If they are, adapt "
+            "near_margin and near_reach of SamplingConfig to this sensor",
+            stacklevel=5,
+        )
 
 
 def passages(hits: Tensor, lines: Lines, ends: Tensor, margin: float) -> Passages:
@@ -136,6 +179,7 @@ def passages(hits: Tensor, lines: Lines, ends: Tensor, margin: float) -> Passage
         return Passages(none, ends[:0], ends[:0], none.bool())
     corner = lines.starts.mean(dim=0)
     patches = find_patches(hits - corner)
+    warn_of_units(patches, margin, len(lines.starts) == 1)
     lines = lines._replace(starts=lines.starts - corner)
     half = NEAR * patches.covariances.diagonal(dim1=1, dim2=2).sqrt()
     boxes = (patches.means - half, patches.means + half)

@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "tensors.h"
+#include "threads.h"
 
 namespace lardhm {
 namespace {
@@ -174,26 +175,32 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
   return state;
 }
 
-// Loss of each row in excess of that of a perfect prediction.
+// Loss of every so many-th row in excess of that of a perfect prediction.
 Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
-                     const Tensor& given_labels, const Tensor& given_weights) {
+                     const Tensor& given_labels, const Tensor& given_weights, int64_t stride) {
   const Tensor indices = tidy(given_indices), values = tidy(given_values);
   const Tensor labels = tidy(given_labels), weights = tidy(given_weights);
   check_descent(indices, values, labels, labels, {weights, weights, weights});
-  const int64_t n = values.size(0), k = values.size(1);
+  check(stride >= 1, "stride must be 1 or more");
+  const int64_t k = values.size(1), n = (values.size(0) + stride - 1) / stride;
   const Tensor losses = new_empty(values, {n});
   const auto run = [&](auto type) {
     using T = decltype(type);
-    const int32_t* index = in<int32_t>(indices);
-    const T* value = in<T>(values);
-    for (int64_t row = 0; row < n; ++row, index += k, value += k) {
-      T sum = 0;
-      for (int64_t j = 0; j < k; ++j) sum += value[j] * in<T>(weights)[index[j]];
-      const T label = in<T>(labels)[row], other = 1 - label;
-      T loss = std::max(sum, T(0)) - sum * label + std::log1p(std::exp(-std::abs(sum)));
-      if (label > 0 && other > 0) loss += label * std::log(label) + other * std::log(other);
-      out<T>(losses)[row] = loss;
-    }
+    constexpr int64_t kGrain = 2048;
+    run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
+      const int64_t end = std::min(n, (task + 1) * kGrain);
+      for (int64_t i = task * kGrain; i < end; ++i) {
+        const int64_t row = i * stride;
+        const int32_t* index = in<int32_t>(indices) + row * k;
+        const T* value = in<T>(values) + row * k;
+        T sum = 0;
+        for (int64_t j = 0; j < k; ++j) sum += value[j] * in<T>(weights)[index[j]];
+        const T label = in<T>(labels)[row], other = 1 - label;
+        T loss = std::max(sum, T(0)) - sum * label + std::log1p(std::exp(-std::abs(sum)));
+        if (label > 0 && other > 0) loss += label * std::log(label) + other * std::log(other);
+        out<T>(losses)[i] = loss;
+      }
+    });
   };
   values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});
   return losses;
@@ -203,7 +210,8 @@ Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
 
 std::vector<Operator> descent_operators() {
   return {
-      {"excess_losses(Tensor indices, Tensor values, Tensor labels, Tensor weights) -> Tensor",
+      {"excess_losses(Tensor indices, Tensor values, Tensor labels, Tensor weights, int stride) -> "
+       "Tensor",
        &boxed<excess_losses>},
       {"descent(Tensor indices, Tensor values, Tensor labels, Tensor factors, Tensor weights, "
        "Tensor mean, Tensor square, int num_points, int batch_size, int first_step, "

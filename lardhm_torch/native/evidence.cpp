@@ -50,22 +50,35 @@ void write(const std::vector<Candidate<T, D>>& found, int64_t size, T* to) {
   std::fill_n(to + kept * D, (size - kept) * D, std::numeric_limits<T>::infinity());
 }
 
+// Writes the `size` points of smallest priority, ascending; false if points of equal priority, which
+// other rules put in order, are among them.
+template <class T, int D>
+bool keep_distinct(const T* points, const int32_t* rows, int64_t n, int64_t size,
+                   std::vector<uint64_t>& keys, T* to) {
+  keys.resize(n);
+  for (int64_t i = 0; i < n; ++i)
+    keys[i] = uint64_t(priority<T, D>(points + int64_t(rows[i]) * D)) << 32 | uint32_t(rows[i]);
+  const auto end = keys.begin() + std::min(n, size + 1);
+  if (n > size + 1) std::nth_element(keys.begin(), end - 1, keys.end());
+  std::sort(keys.begin(), end);
+  for (auto key = keys.begin(); key + 1 < end; ++key)
+    if (*key >> 32 == *(key + 1) >> 32) return false;
+  const int64_t kept = std::min(n, size);
+  for (int64_t i = 0; i < kept; ++i) std::copy_n(points + int64_t(uint32_t(keys[i])) * D, D, to + i * D);
+  std::fill_n(to + kept * D, (size - kept) * D, std::numeric_limits<T>::infinity());
+  return true;
+}
+
 // The `size` smallest distinct candidates of a cluster, ascending.
 template <class T, int D>
 void keep(const T* points, const int32_t* rows, int64_t n, int64_t size,
-          std::vector<Candidate<T, D>>& found, T* to) {
+          std::vector<uint64_t>& keys, std::vector<Candidate<T, D>>& found, T* to) {
+  if (keep_distinct<T, D>(points, rows, n, size, keys, to)) return;
   found.resize(n);
   for (int64_t i = 0; i < n; ++i) {
     const T* point = points + int64_t(rows[i]) * D;
     found[i].rank = priority<T, D>(point);
     std::copy_n(point, D, found[i].point);
-  }
-  if (n > 4 * size) {  // repeated points are rare: the smallest 2 size hold enough distinct ones
-    std::nth_element(found.begin(), found.begin() + 2 * size, found.end());
-    std::sort(found.begin(), found.begin() + 2 * size);
-    const auto end = std::unique(found.begin(), found.begin() + 2 * size);
-    if (end - found.begin() >= size) return write(found, size, to);
-    found.erase(end, found.begin() + 2 * size);
   }
   std::sort(found.begin(), found.end());
   found.erase(std::unique(found.begin(), found.end()), found.end());
@@ -85,10 +98,11 @@ Tensor keep_points(const Tensor& given_points, const Tensor& given_owners, int64
     const Groups groups(in<int32_t>(owners), points.size(0), num_clusters);
     constexpr int64_t kGrain = 64;
     run_tasks((num_clusters + kGrain - 1) / kGrain, [&](int64_t task) {
+      std::vector<uint64_t> keys;
       std::vector<Candidate<T, D>> found;
       for (int64_t m = task * kGrain; m < std::min(num_clusters, (task + 1) * kGrain); ++m)
         keep<T, D>(in<T>(points), groups.rows.data() + groups.first[m],
-                   groups.first[m + 1] - groups.first[m], size, found,
+                   groups.first[m + 1] - groups.first[m], size, keys, found,
                    out<T>(kept) + m * size * D);
     });
     return 0;

@@ -9,6 +9,8 @@
 #include <vector>
 
 #include "clusters.h"
+#include "jacobi.h"
+#include "priority.h"
 
 namespace lardhm {
 namespace {
@@ -74,9 +76,14 @@ Tensor kept_counts(const Tensor& given) {
   return counts;
 }
 
-Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows) {
-  const Tensor evidence = tidy(given), rows = tidy(given_rows);
-  check(rows.scalar_type() == ScalarType::Long, "rows must be int64");
+// The points of some clusters; of each at most `most`, which may be empty.
+Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows, const Tensor& given_most) {
+  const Tensor evidence = tidy(given), rows = tidy(given_rows), limits = tidy(given_most);
+  check(rows.scalar_type() == ScalarType::Long && limits.scalar_type() == ScalarType::Long,
+        "rows and most must be int64");
+  check(limits.numel() == 0 || limits.numel() == evidence.size(0),
+        "most must be (M,), one per cluster");
+  const int64_t* most = limits.numel() ? in<int64_t>(limits) : nullptr;
   const int64_t count = rows.numel(), size = evidence.size(1);
   for (int64_t i = 0; i < count; ++i)
     check(in<int64_t>(rows)[i] >= 0 && in<int64_t>(rows)[i] < evidence.size(0),
@@ -87,8 +94,10 @@ Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows) {
     using T = decltype(type);
     constexpr int D = dim();
     const T* all = in<T>(evidence);
-    for (int64_t i = 0; i < count; ++i)
-      first[i + 1] = first[i] + count_kept<T, D>(all + in<int64_t>(rows)[i] * size * D, size);
+    for (int64_t i = 0; i < count; ++i) {
+      const int64_t row = in<int64_t>(rows)[i], kept = count_kept<T, D>(all + row * size * D, size);
+      first[i + 1] = first[i] + (most ? std::max<int64_t>(0, std::min(kept, most[row])) : kept);
+    }
     points = new_empty(evidence, {first[count], D});
     owners = new_empty(evidence, {first[count]}, ScalarType::Long);
     for_rows(count, [&](int64_t i) {
@@ -100,29 +109,68 @@ Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows) {
   return {points, owners};
 }
 
-// Of the points of each cluster, the number of those that it keeps already.
-Tensor kept_again(const Tensor& given_points, const Tensor& given_owners, const Tensor& given) {
+// The largest priority of the points that clusters keep, found when it is first asked for.
+template <class T, int D>
+class LastPriorities {
+  static constexpr uint32_t kUnknown = ~0u, kAny = kUnknown - 1;
+  const T* evidence;
+  const bool* cleared;
+  int64_t size;
+  std::vector<std::atomic<uint32_t>> found;
+
+ public:
+  LastPriorities(const T* evidence_, int64_t count, int64_t size_, const bool* cleared_)
+      : evidence(evidence_), cleared(cleared_), size(size_), found(count) {
+    for (auto& one : found) one.store(kUnknown, std::memory_order_relaxed);
+  }
+
+  // Of a cluster that has room, or that loses its points: larger than all priorities.
+  uint32_t of(int64_t row) {
+    uint32_t last = found[row].load(std::memory_order_relaxed);
+    if (last != kUnknown) return last;
+    const T* points = evidence + row * size * D;
+    last = 0;
+    if (cleared[row] || count_kept<T, D>(points, size) < size)
+      last = kAny;
+    else
+      for (int64_t j = 0; j < size; ++j) last = std::max(last, priority<T, D>(points + j * D));
+    found[row].store(last, std::memory_order_relaxed);
+    return last;
+  }
+};
+
+// How many points each cluster keeps already, and which points it can keep, see `evidence.kept_again`.
+Tensors<2> kept_again(const Tensor& given_points, const Tensor& given_owners, const Tensor& given,
+                      const Tensor& given_cleared) {
   const Tensor points = tidy(given_points), owners = tidy(given_owners), evidence = tidy(given);
+  const Tensor cleared = tidy(given_cleared);
   const int64_t n = points.size(0), count = evidence.size(0), size = evidence.size(1);
   check(owners.scalar_type() == ScalarType::Long && owners.numel() == n &&
             points.scalar_type() == evidence.scalar_type() && points.size(1) == evidence.size(2),
         "points must be (N, D) like the evidence, owners (N,) int64");
-  const Tensor again = new_zeros(evidence, {count}, ScalarType::Long);
+  check(cleared.scalar_type() == ScalarType::Bool && cleared.numel() >= count && size > 0,
+        "cleared must be bool, one per cluster");
+  const Tensor again = new_zeros(evidence, {cleared.numel()}, ScalarType::Long);
+  const Tensor enters = new_empty(evidence, {n}, ScalarType::Bool);
+  std::vector<char> is_kept(n, 0);
   with_evidence(evidence, [&](auto type, auto dim) {
     using T = decltype(type);
     constexpr int D = dim();
-    for (int64_t i = 0; i < n; ++i) {
+    LastPriorities<T, D> last(in<T>(evidence), count, size, in<bool>(cleared));
+    for_rows(n, [&](int64_t i) {
       const int64_t row = in<int64_t>(owners)[i];
-      if (row < 0 || row >= count) continue;
+      out<bool>(enters)[i] = row >= 0;
+      if (row < 0 || row >= count) return;
       const T *point = in<T>(points) + i * D, *kept = in<T>(evidence) + row * size * D;
-      for (int64_t j = 0; j < size; ++j, kept += D)
-        if (std::equal(point, point + D, kept)) {
-          ++out<int64_t>(again)[row];
-          break;
-        }
-    }
+      const bool is_late = priority<T, D>(point) > last.of(row);
+      for (int64_t j = 0; j < size && !is_late && !is_kept[i]; ++j, kept += D)
+        is_kept[i] = std::equal(point, point + D, kept);
+      out<bool>(enters)[i] = !is_late && !is_kept[i];
+    });
   });
-  return again;
+  for (int64_t i = 0; i < n; ++i)
+    if (is_kept[i]) ++out<int64_t>(again)[in<int64_t>(owners)[i]];
+  return {again, enters};
 }
 
 // Moments of the kept points of one cluster, in double precision.
@@ -212,40 +260,16 @@ Tensors<4> follow_kept(
   return {centers, means, scatters, raw};
 }
 
-// Direction of the largest eigenvalue of a symmetric matrix, by Jacobi's method; its largest component
-// is positive.
+// Direction of the largest eigenvalue of a symmetric matrix; its largest component is positive.
 template <int D>
 void longest_axis(const double* matrix, double* axis) {
-  constexpr int kSweeps = 12;
-  double a[D][D], v[D][D] = {};
-  for (int i = 0; i < D; ++i) {
-    v[i][i] = 1;
-    for (int j = 0; j < D; ++j) a[i][j] = matrix[i * D + j];
-  }
-  for (int sweep = 0; sweep < kSweeps; ++sweep)
-    for (int p = 0; p < D; ++p)
-      for (int q = p + 1; q < D; ++q) {
-        if (a[p][q] == 0) continue;
-        const double half = (a[q][q] - a[p][p]) / (2 * a[p][q]);
-        const double t = std::copysign(1 / (std::abs(half) + std::sqrt(half * half + 1)), half);
-        const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-        for (int i = 0; i < D; ++i) {
-          const double x = a[i][p], y = a[i][q];
-          a[i][p] = c * x - s * y, a[i][q] = s * x + c * y;
-        }
-        for (int i = 0; i < D; ++i) {
-          const double x = a[p][i], y = a[q][i];
-          a[p][i] = c * x - s * y, a[q][i] = s * x + c * y;
-          const double z = v[i][p], w = v[i][q];
-          v[i][p] = c * z - s * w, v[i][q] = s * z + c * w;
-        }
-      }
-  int longest = 0, largest = 0;
+  double values[D], axes[D][D];
+  jacobi<D>(matrix, values, axes);
+  int largest = 0;
   for (int i = 1; i < D; ++i)
-    if (a[i][i] > a[longest][longest]) longest = i;
-  for (int i = 1; i < D; ++i)
-    if (std::abs(v[i][longest]) > std::abs(v[largest][longest])) largest = i;
-  for (int i = 0; i < D; ++i) axis[i] = v[largest][longest] < 0 ? -v[i][longest] : v[i][longest];
+    if (std::abs(axes[i][D - 1]) > std::abs(axes[largest][D - 1])) largest = i;
+  const double sign = axes[largest][D - 1] < 0 ? -1 : 1;
+  for (int i = 0; i < D; ++i) axis[i] = sign * axes[i][D - 1];
 }
 
 // The kept points of each cluster, divided at their mean along the longest axis.
@@ -281,8 +305,10 @@ Tensors<2> halves(const Tensor& given) {
 std::vector<Operator> kept_operators() {
   return {
       {"kept_counts(Tensor evidence) -> Tensor", &boxed<kept_counts>},
-      {"kept_points(Tensor evidence, Tensor rows) -> (Tensor, Tensor)", &boxed<kept_points>},
-      {"kept_again(Tensor points, Tensor owners, Tensor evidence) -> Tensor", &boxed<kept_again>},
+      {"kept_points(Tensor evidence, Tensor rows, Tensor most) -> (Tensor, Tensor)",
+       &boxed<kept_points>},
+      {"kept_again(Tensor points, Tensor owners, Tensor evidence, Tensor cleared) -> (Tensor, Tensor)",
+       &boxed<kept_again>},
       {"halves(Tensor evidence) -> (Tensor, Tensor)", &boxed<halves>},
       {"kept_moments(Tensor evidence) -> (Tensor, Tensor, Tensor)", &boxed<kept_moments>},
       {"follow_kept(Tensor evidence, Tensor counts, Tensor centers, Tensor means, Tensor scatters, "

@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "simd.h"
 #include "tensors.h"
 #include "threads.h"
 
@@ -125,48 +126,110 @@ struct Ray {
   }
 };
 
-// The boxes of a binary tree with the leaves at the end: the children of node n are 2 n and 2 n + 1.
+// Eight boxes, a register for each bound, a little larger than their originals: single precision
+// excludes only boxes that double precision excludes, too.
+using Eight = Vectors<float, 32>;
+
+template <int D>
+struct Boxes {
+  Eight::V low[D], high[D];
+};
+
+template <int D>
+struct Sight {  // a ray in single precision
+  Eight::V start[D], inverse[D];
+  float end;
+
+  explicit Sight(const Ray<D>& ray) : end(float(ray.end * (1 + 1e-6))) {
+    for (int d = 0; d < D; ++d) {
+      start[d] = Eight::V{} + float(ray.start[d]);
+      inverse[d] = Eight::V{} + float(ray.inverse[d]);
+    }
+  }
+
+  // One bit for each box that the ray meets.
+  uint32_t meets(const Boxes<D>& boxes) const {
+    Eight::V enter = {}, leave = Eight::V{} + end;
+    for (int d = 0; d < D; ++d) {
+      const Eight::V one = (boxes.low[d] - start[d]) * inverse[d];
+      const Eight::V other = (boxes.high[d] - start[d]) * inverse[d];
+      enter = vmax(enter, vmin(one, other));
+      leave = vmin(leave, vmax(one, other));
+    }
+    return bits_le<Eight::I>(enter <= leave, Eight::I{} - 1);
+  }
+};
+
+// The boxes of a tree whose nodes have eight children each; the root has fewer.
 template <int D>
 class Forest {
-  std::vector<Box<D>> boxes;
+  std::vector<std::vector<Boxes<D>>> levels;  // from the children of the root to the leaves
+  std::vector<Box<D>> leaves;
   std::vector<Patch<D>> patches;
 
+  // Boxes in groups of eight. A bound is moved out by what a float may be wrong there.
+  static std::vector<Boxes<D>> grouped(const std::vector<Box<D>>& boxes, double far) {
+    constexpr double kRounding = 4e-6;
+    std::vector<Boxes<D>> groups((boxes.size() + 7) / 8);
+    for (size_t i = 0; i < 8 * groups.size(); ++i)
+      for (int d = 0; d < D; ++d) {
+        constexpr double kNowhere = 1e30;  // no ray meets what fills the last group
+        const bool is_box = i < boxes.size();
+        const double low = is_box ? boxes[i].low[d] : kNowhere;
+        const double high = is_box ? boxes[i].high[d] : kNowhere;
+        const double slack = is_box ? kRounding * (far + std::max(std::abs(low), std::abs(high))) : 0;
+        groups[i / 8].low[d][i % 8] = float(low - slack);
+        groups[i / 8].high[d][i % 8] = float(high + slack);
+      }
+    return groups;
+  }
+
  public:
+  // `far`: largest coordinate of a ray's start.
   Forest(const Tensor& low, const Tensor& high, const Tensor& means, const Tensor& precisions,
-         const Tensor& normals, const Tensor& clear)
-      : boxes(2 * low.size(0)), patches(low.size(0)) {
+         const Tensor& normals, const Tensor& clear, double far)
+      : leaves(low.size(0)), patches(low.size(0)) {
     const int64_t count = low.size(0);
     for (int64_t i = 0; i < count; ++i) {
-      std::copy_n(doubles(low) + i * D, D, boxes[count + i].low);
-      std::copy_n(doubles(high) + i * D, D, boxes[count + i].high);
+      std::copy_n(doubles(low) + i * D, D, leaves[i].low);
+      std::copy_n(doubles(high) + i * D, D, leaves[i].high);
       std::copy_n(doubles(means) + i * D, D, patches[i].mean);
       std::copy_n(doubles(precisions) + i * D * D, D * D, patches[i].precision);
       std::copy_n(doubles(normals) + i * D, D, patches[i].normal);
       patches[i].clear = doubles(clear)[i];
     }
-    for (int64_t i = count - 1; i > 0; --i)
-      for (int d = 0; d < D; ++d) {
-        boxes[i].low[d] = std::min(boxes[2 * i].low[d], boxes[2 * i + 1].low[d]);
-        boxes[i].high[d] = std::max(boxes[2 * i].high[d], boxes[2 * i + 1].high[d]);
+    std::vector<Box<D>> boxes = leaves;
+    levels.push_back(grouped(boxes, far));
+    while (boxes.size() > 8) {
+      for (size_t i = 0; i < boxes.size() / 8; ++i) {
+        Box<D> whole = boxes[8 * i];
+        for (int j = 1; j < 8; ++j)
+          for (int d = 0; d < D; ++d) {
+            whole.low[d] = std::min(whole.low[d], boxes[8 * i + j].low[d]);
+            whole.high[d] = std::max(whole.high[d], boxes[8 * i + j].high[d]);
+          }
+        boxes[i] = whole;
       }
+      boxes.resize(boxes.size() / 8);
+      levels.insert(levels.begin(), grouped(boxes, far));
+    }
   }
 
   // Appends the pairs of a ray, the patches in ascending order.
   void follow(const Ray<D>& ray, int64_t row, double limit,
               std::vector<std::pair<int64_t, int64_t>>& found) const {
-    const int64_t count = int64_t(patches.size());
-    int64_t waiting[64];
-    int depth = 0;
-    waiting[depth++] = 1;
-    while (depth) {
-      const int64_t node = waiting[--depth];
-      if (!ray.meets(boxes[node])) continue;
-      if (node < count) {
-        waiting[depth++] = 2 * node + 1;
-        waiting[depth++] = 2 * node;
-      } else if (ray.passes(patches[node - count], limit)) {
-        found.emplace_back(row, node - count);
-      }
+    descend(ray, Sight<D>(ray), 0, 0, row, limit, found);
+  }
+
+ private:
+  void descend(const Ray<D>& ray, const Sight<D>& sight, size_t level, int64_t group, int64_t row,
+               double limit, std::vector<std::pair<int64_t, int64_t>>& found) const {
+    for (uint32_t met = sight.meets(levels[level][group]); met; met &= met - 1) {
+      const int64_t node = 8 * group + __builtin_ctz(met);
+      if (level + 1 < levels.size())
+        descend(ray, sight, level + 1, node, row, limit, found);
+      else if (ray.meets(leaves[node]) && ray.passes(patches[node], limit))
+        found.emplace_back(row, node);
     }
   }
 };
@@ -225,7 +288,9 @@ std::array<Tensor, 2> passing(Tensor starts, Tensor ahead, Tensor reach, Tensor 
         "starts must be (R, D) or (1, D), depths (R,)");
   check_patches(ahead, low, high, means, precisions, normals, clear);
   const auto run = [&](auto dim) {
-    const Forest<dim()> forest(low, high, means, precisions, normals, clear);
+    double far = 0;
+    for (int64_t i = 0; i < starts.numel(); ++i) far = std::max(far, std::abs(doubles(starts)[i]));
+    const Forest<dim()> forest(low, high, means, precisions, normals, clear, far);
     return follow_all<dim()>(forest, starts, ahead, reach, ends, limit);
   };
   const std::vector<Pairs> found = ahead.size(1) == 2 ? run(std::integral_constant<int, 2>{})

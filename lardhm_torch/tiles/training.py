@@ -106,7 +106,7 @@ def cluster_tile(
     """
     classes = [tile.core_points(label) for label in (OCCUPIED, 0)]
     classes = [in_morton_order(points)[0] if len(points) else points for points in classes]
-    return TileClusters(*cluster_each(classes, num_clusters, rng))
+    return TileClusters(*cluster_each(classes, num_clusters, rng)[:2])
 
 
 def train_tile(

@@ -26,8 +26,9 @@ from lardhm_torch.evaluation.baselines.octomap import OctoMapBaseline
 from lardhm_torch.evaluation.baselines.original_hilbert_map import OriginalHilbertMap
 from lardhm_torch.features import raw_factors
 from lardhm_torch.io.octrees import to_array
-from lardhm_torch.learning.clustering import clusters_from_moments, mini_batch_kmeans
+from lardhm_torch.learning.clustering import clusters_from_moments
 from lardhm_torch.learning.fitting import fit_weights, stratified_batches
+from lardhm_torch.learning.kmeans import mini_batch_kmeans
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.learning.points import in_morton_order
 

@@ -18,7 +18,7 @@ from lardhm_torch.evaluation.baselines.gaussian_process import (
     squared_exponential,
     squash,
 )
-from lardhm_torch.learning.clustering import mini_batch_kmeans
+from lardhm_torch.learning.kmeans import mini_batch_kmeans
 from lardhm_torch.learning.points import check_samples, in_morton_order
 from lardhm_torch.native import nearest_centers
 
