@@ -8,6 +8,7 @@
 # make try-wheel install the latter without a compiler; compare its speed with a library compiled here
 # make versions  try that wheel with old and new versions of Python and the libraries (gigabytes)
 # make sanitize  run the native tests with AddressSanitizer and UndefinedBehaviorSanitizer (minutes)
+# make try-viewer drive the viewer in Chromium: times and screenshots (out/viewer/); needs ../shared/data
 # make bench     run the benchmarks (minutes)
 # make soak      run the long tests: extras, fuzzing, flipped bits, kills, full disks (tens of minutes)
 
@@ -16,6 +17,7 @@ BIN := .venv/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 	$(shell grep -o '^torch==[^ ]*' constraints.txt)
 WHEELS := out/wheels
+DATA ?= ../shared/data
 QUICK := public scans sampling features io_npz simulation kernel_cache native_query native_extremes \
 	native_gradients native_update marching atomic_files
 PARALLEL := -n auto --maxprocesses 8 --dist loadfile  # a process for each core
@@ -33,7 +35,7 @@ LONG := tests/test_streaming.py::test_a_stream_killed_at_any_moment_ends_as_if_i
 EXTRAS := tests/test_onnx_files.py tests/test_rerun_files.py tests/test_kiss_icp_poses.py
 export MPLBACKEND := Agg
 
-.PHONY: demo test check bench soak docs wheel try-wheel versions sanitize
+.PHONY: demo test check bench soak docs wheel try-wheel versions sanitize try-viewer
 .DELETE_ON_ERROR:
 
 .venv/demo: pyproject.toml constraints.txt
@@ -92,6 +94,9 @@ sanitize: .venv/ready
 docs: .venv/ready
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 	@echo "documentation: out/docs/index.html"
+
+try-viewer: .venv/ready
+	$(BIN)/python scripts/drive_viewer.py $(DATA) -o out/viewer
 
 bench: .venv/bench
 	$(BIN)/python benchmarks/speed.py

@@ -25,7 +25,7 @@ from lardhm_torch import LardHilbertMap, load_scans, sample_rays, save_scans, sp
 from lardhm_torch.evaluation.held_out import protocol_rays
 
 PATIENCE = 120_000  # [ms]
-MOVES = 8
+MOVES = 6
 INTERRUPTS = (0.05, 0.2, 0.4, 0.8)  # [s] after a change
 WATCH = """
 window.shown = [];  // times at which a frame ended that drew newly uploaded vertices

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial import cKDTree
 from small_maps import wall_map
 from tiled_maps import (
@@ -21,7 +22,7 @@ from lardhm_torch.queries.frontiers import frontiers
 from lardhm_torch.queries.grids import map_bounds, occupancy_gradient, query_grid
 from lardhm_torch.queries.raycasting import surface_step, thickness_counts
 from lardhm_torch.scans import split_rays
-from lardhm_torch.tiles import layout
+from lardhm_torch.tiles import layout, local_maps
 from lardhm_torch.tiles.indexing import tile_indices
 from lardhm_torch.tiles.layout import layout_of, needed_tiles
 from lardhm_torch.tiles.splitting import join_states, state_of
@@ -365,6 +366,7 @@ def test_bad_arguments_are_named(tmp_path, monkeypatch):
 
 
 def test_a_part_of_a_tiled_map_is_meshed_from_the_tiles_that_it_needs(tmp_path, monkeypatch):
+    monkeypatch.setattr(local_maps, "PIECE_CLUSTERS", 1)  # a tile each
     tiles = tiled(random_map(1), tmp_path, monkeypatch)
     lower, upper = map_bounds(tiles)
     bounds = lower, lower + 0.3 * (upper - lower)
@@ -376,19 +378,23 @@ def test_a_part_of_a_tiled_map_is_meshed_from_the_tiles_that_it_needs(tmp_path, 
 
 
 def test_parts_of_a_map_have_the_faces_of_the_whole(tmp_path, monkeypatch):
-    tiles = tiled(random_map(2), tmp_path, monkeypatch)
-    lower, upper = map_bounds(tiles)
-    lower, upper = (lower / 0.2).floor() * 0.2, (upper / 0.2).ceil() * 0.2
-    middle = (lower / 0.2 + ((upper - lower) / 0.4).round()).round() * 0.2
-    count = len(
-        extract_mesh(tiles, 0.2, bounds=(lower, upper), color=None, surface="crossing").faces
-    )
-    found = 0
-    for side in range(2):
-        low, high = lower.clone(), upper.clone()
-        (high if side == 0 else low)[0] = middle[0]
-        found += len(
-            extract_mesh(tiles, 0.2, bounds=(low, high), color=None, surface="crossing").faces
-        )
-    assert count > 1000
-    assert found == pytest.approx(count, rel=0.001)
+    """Also at their borders, and with vertices that move to the same places."""
+    monkeypatch.setattr(layout, "BLOCK_CLUSTERS", 1)
+    tiles = TiledMap.split(wall_map(), tmp_path / "tiles", 0.7)
+    lower, upper = (bound.numpy() for bound in map_bounds(tiles))
+    low, high = np.floor(lower / 0.05) - 1, np.ceil(upper / 0.05) + 1
+    whole = extract_mesh(tiles, 0.05, color=None)
+    middle = 8 * round(np.median(whole.vertices[:, 1]) / 0.4)  # a border of blocks
+    parts = []
+    for ends in ((low[1], middle), (middle, high[1])):
+        corners = np.stack([low, high])
+        corners[:, 1] = ends
+        parts.append(extract_mesh(tiles, 0.05, bounds=(*(0.05 * corners),), color=None))
+    joined = trimesh.util.concatenate(parts)
+    joined.merge_vertices(merge_norm=True, digits_vertex=4)
+    assert len(whole.faces) > 1000
+    assert min(len(part.faces) for part in parts) > 200
+    assert len(joined.faces) == pytest.approx(len(whole.faces), rel=0.001)
+    assert len(joined.vertices) == pytest.approx(len(whole.vertices), rel=0.001)
+    distance = cKDTree(joined.triangles_center).query(whole.triangles_center)[0]
+    assert np.mean(distance > 1e-4) < 0.001

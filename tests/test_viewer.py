@@ -1,6 +1,9 @@
 import importlib.util
 import io
 import json
+import signal
+import subprocess
+import sys
 import time
 from types import SimpleNamespace
 
@@ -162,6 +165,18 @@ def test_a_viewer_that_is_closed_gives_up_what_it_draws(model):
     shown.close()
     worker.join(60)
     assert not worker.is_alive()
+
+
+def test_the_command_ends_at_once_while_it_draws(model, tmp_path):
+    model.save(tmp_path / "map.pt")
+    command = [sys.executable, "-m", "lardhm_torch.cli", "view", str(tmp_path / "map.pt")]
+    command += ["--resolution", "0.004"]  # would take minutes
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        next(line for line in process.stdout if "Ctrl-C stops it" in line)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+        assert "stopped" in process.stdout.read()
 
 
 def test_a_map_under_construction_is_shown_as_it_grows(scans, page):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,7 +146,8 @@ def view(arguments: argparse.Namespace) -> None:
         print(f"{viewer.url}  (Ctrl-C stops it)", flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:
-        print("stopped")
+        print("stopped", flush=True)
+        os._exit(0)  # the interpreter would wait for the drawing thread, or abort in it
     finally:
         viewer.close()
 

@@ -313,4 +313,5 @@ def _map_samples(
     points, owners = kept_points(state.evidence)
     tensors = (state.centers, state.raw_scale_tril, state.weights, kernel)
     labels = native.occupancy(points, *tensors, probability=True)
-    return points, labels, state.kinds[owners], evidence_weights(state, kept_counts(state.evidence))[owners]
+    strength = evidence_weights(state, kept_counts(state.evidence))
+    return points, labels, state.kinds[owners], strength[owners]

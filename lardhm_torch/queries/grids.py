@@ -259,7 +259,8 @@ class SupportingClusters:
         chosen = (model.weights.detach() * sign > 0).nonzero().squeeze(1)
         self.origin = model.origin
         self.centers = model.centers.detach()[chosen]
-        self.stds = torch.linalg.svdvals(model.scale_tril.detach()[chosen].double())[:, -1]
+        self.factors = model.scale_tril.detach()[chosen]
+        self.stds = torch.full_like(self.centers[:, 0], torch.nan, dtype=torch.float64)
         self.index = build_index(self.centers, 1)
 
     def nearest(self, points: Tensor) -> Support:
@@ -268,6 +269,8 @@ class SupportingClusters:
             return Support(torch.full_like(points, torch.nan), torch.zeros_like(points[:, 0]))
         local = (points - self.origin).to(self.centers.dtype)
         nearest = nearest_centers(local, self.centers, 1, self.index).squeeze(1)
+        new = nearest[self.stds[nearest].isnan()].unique()
+        self.stds[new] = torch.linalg.svdvals(self.factors[new].double())[:, -1]
         return Support(self.centers[nearest].double() + self.origin, self.stds[nearest])
 
 

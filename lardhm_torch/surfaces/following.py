@@ -167,8 +167,8 @@ def _apart(lattice: Lattice, centers: Tensor, reach: Tensor) -> Tensor:
 
 
 def _crossed(model: OccupancyMap, lines: Tensor, rule: Rule) -> tuple[Tensor, Tensor]:
-    """(S, R, W, 3) points along lines -> (R,) whether any of W lines crosses the surface, and both ends of
-    the steps that do (N, 3)."""
+    """(S, R, W, 3) points along lines -> (R,) whether any of W lines crosses the surface, and (N, 3)
+    both ends of the steps that do."""
     log_odds = model.log_odds(lines)
     inside = log_odds > rule.level
     crossed = inside[1:] != inside[:-1]

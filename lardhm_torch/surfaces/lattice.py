@@ -30,7 +30,8 @@ class Lattice:
         cells: (3,) int64 number of cells along each axis, at least 1.
         resolution: distance of the points [m].
         keep: keep all log-odds that were computed, for surfaces at other levels.
-        is_cut: whether the map continues outside of the lattice.
+        core: (2, 3) int64, first and last point, in multiples of the resolution, of the box whose faces
+            are wanted, if the map continues outside of it; None: it does not.
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class Lattice:
         resolution: float,
         *,
         keep: bool = False,
-        is_cut: bool = False,
+        core: np.ndarray | None = None,
     ) -> None:
-        self.first, self.cells, self.resolution, self.is_cut = first, cells, resolution, is_cut
+        self.first, self.cells, self.resolution, self.core = first, cells, resolution, core
+        self.is_cut = core is not None
         self.shape = -(-cells // BLOCK_CELLS)
         if np.prod(self.shape.astype(np.float64)) > MAX_BLOCKS:
             raise ValueError(
@@ -62,6 +64,12 @@ class Lattice:
         lower, upper = (torch.from_numpy(end * self.resolution) for end in ends)
         return lower, upper
 
+    def in_core(self, points: np.ndarray) -> np.ndarray:
+        """(N,) whether (N, 3) world positions [m] lie in the core."""
+        assert self.core is not None
+        low, high = self.core * self.resolution
+        return ((points >= low) & (points <= high)).all(axis=1)
+
     def place(self, blocks: np.ndarray) -> np.ndarray:
         """(B,) numbers of blocks -> (B, 3) their first points, in cells from the first point."""
         return np.stack(np.unravel_index(blocks, self.shape), axis=1) * BLOCK_CELLS
@@ -78,7 +86,7 @@ class Lattice:
         return np.unique(np.ravel_multi_index((cell // BLOCK_CELLS).T, self.shape))
 
     def block_places(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) world positions [m] -> (N, 3) int64 place of their blocks; also outside of the lattice."""
+        """(N, 3) world positions [m] -> (N, 3) int64 place of their blocks, also outside the lattice."""
         cell = np.floor(points / self.resolution).astype(np.int64) - self.first
         return cell // BLOCK_CELLS
 

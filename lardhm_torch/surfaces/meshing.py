@@ -29,12 +29,14 @@ from lardhm_torch.surfaces.channel_colors import UNKNOWN_COLOR, class_labels, la
 from lardhm_torch.surfaces.closing import closed_sheet
 from lardhm_torch.surfaces.estimate import check_mesh_memory, estimate_mesh
 from lardhm_torch.surfaces.following import Rule, Sheet, follow_surface, seed_blocks
-from lardhm_torch.surfaces.lattice import Lattice, blocks_near_boxes, border_blocks
+from lardhm_torch.surfaces.lattice import BLOCK_CELLS, Lattice, blocks_near_boxes, border_blocks
 from lardhm_torch.surfaces.ridge import sheet_on_ridge
 from lardhm_torch.surfaces.vertex_colors import COLORS, vertex_colors
 
 if TYPE_CHECKING:
     import trimesh
+
+RIM = 3  # cells around a part: a vertex moves by the means of its neighbors and of theirs
 
 
 @reads_copy
@@ -135,9 +137,10 @@ def surface_lattice(
 ) -> Lattice | None:
     """Lattice for `lattice_mesh`, valid for all thresholds on the same side of 1/2.
 
-    Its points are whole multiples of the resolution, so parts of a map that are meshed one by one
-    fit together. ``keep`` keeps its log-odds for further thresholds; the other arguments are those
-    of `extract_mesh`.
+    Its points are whole multiples of the resolution and its blocks are at multiples of their edge.
+    Around a part of the map, it has `RIM` more cells or more, so vertices at the bounds are where they
+    are in the mesh of the whole map: parts that are meshed one by one fit together. ``keep`` keeps its
+    log-odds for further thresholds; the other arguments are those of `extract_mesh`.
 
     Returns:
         The lattice; None if no supporting cluster is near the bounds.
@@ -157,16 +160,19 @@ def surface_lattice(
         return None
     expected = estimate_mesh(model, resolution, corners, _sign(threshold), watertight=watertight)
     check_mesh_memory(resolution, expected)
+    core = None
     if bounds is None:
-        first, last = (
-            np.floor(lower.min(axis=0) / resolution),
-            np.ceil(upper.max(axis=0) / resolution),
-        )
+        first = np.floor(lower.min(axis=0) / resolution)
+        last = np.ceil(upper.max(axis=0) / resolution)
     else:
         first, last = np.round(low / resolution), np.round(high / resolution)
+        core = np.stack([first, np.maximum(last, first + 1)]).astype(np.int64)
+    if not watertight:  # blocks are the same in all parts of a map
+        around = 0 if core is None else RIM
+        first = np.floor((first - around) / BLOCK_CELLS) * BLOCK_CELLS
+        last = np.ceil((last + around) / BLOCK_CELLS) * BLOCK_CELLS
     cells = (last - first).clip(min=1).astype(np.int64)
-    is_cut = bounds is not None
-    return Lattice(first.astype(np.int64), cells, resolution, keep=keep, is_cut=is_cut)
+    return Lattice(first.astype(np.int64), cells, resolution, keep=keep, core=core)
 
 
 def lattice_mesh(
@@ -206,9 +212,11 @@ def lattice_mesh(
             margin = log_odds_margin or 0.0
             sheet = closed_sheet(model, lattice, threshold, margin, on_ridge=on_ridge, report=count)
         else:
-            sheet = _open_sheet(model, lattice, threshold, log_odds_margin, count)
-            if on_ridge:
-                sheet = sheet_on_ridge(model, sheet, lattice.resolution)
+            level = _open_sheet(model, lattice, threshold, log_odds_margin, count)
+            sheet = sheet_on_ridge(model, level, lattice.resolution) if on_ridge else level
+            if lattice.is_cut:
+                inside = lattice.in_core(level.vertices[sheet.faces].mean(axis=1))
+                sheet = sheet._replace(faces=sheet.faces[inside])
     report(0)
     vertices, faces, normals, _, closing = sheet.without_unused()
     attributes: dict[str, Any] = {} if closing is None else {"closing": closing.astype(np.int32)}

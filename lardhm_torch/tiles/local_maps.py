@@ -14,6 +14,8 @@ from lardhm_torch.tiles.layout import FLOAT32_RANGE, layout_of, needed_tiles
 from lardhm_torch.tiles.splitting import TileState, join_states
 from lardhm_torch.tiles.store import Cache, DamagedTileError, TileStore
 
+PIECE_CLUSTERS = 1 << 14  # of a group of tiles in `LocalMaps.pieces`
+
 
 class LocalMaps:
     """Maps that are valid in blocks and boxes of a tiled map (see `layout`).
@@ -76,12 +78,34 @@ class LocalMaps:
             self.cache.put_map("whole", model)
         return model
 
-    def tile_maps(self, bounds: tuple[Tensor, Tensor] | None = None) -> Iterator[LardHilbertMap]:
-        """The map of each tile, or of those that a box (D,) to (D,) needs, in its own frame."""
-        tiles = self._tiles()
+    def pieces(self, bounds: tuple[Tensor, Tensor] | None = None) -> Iterator[LardHilbertMap]:
+        """Maps of groups of tiles, one at a time; with a box (D,) to (D,), of those that it needs.
+
+        A group has at most `PIECE_CLUSTERS` clusters, or a quarter of what the limit allows. The groups
+        do not depend on the box, so that those of the next box are cached.
+        """
+        needed = set(range(len(self.layout.indices)))
         if bounds is not None:
-            tiles = (self._tile(row) for row in needed_tiles(self.layout, *bounds).tolist())
-        return (self._join([tile], tile["origin"]) for tile in tiles)
+            needed = set(needed_tiles(self.layout, *bounds).tolist())
+        most = min(PIECE_CLUSTERS, self.cache.limit // (4 * self.store.bytes_per_cluster))
+        group: list[int] = []
+        clusters = 0
+        for row, count in enumerate([*self.layout.counts.tolist(), most]):
+            if group and clusters + count > most:
+                if not needed.isdisjoint(group):
+                    yield self._piece(group)
+                group, clusters = [], 0
+            group.append(row)
+            clusters += count
+
+    def _piece(self, rows: list[int]) -> LardHilbertMap:
+        """The map of some tiles, cached."""
+        key = ("piece", *rows)
+        model = self.cache.map(key)
+        if model is None:
+            model = self._join([self._tile(row) for row in rows], self._frame(torch.tensor(rows)))
+            self.cache.put_map(key, model)
+        return model
 
     def _joined_map(self, rows: Tensor, points: Tensor) -> LardHilbertMap:
         """The map of tiles (S,), cached; an error if the box of the points needs a damaged one."""

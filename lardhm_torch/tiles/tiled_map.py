@@ -229,8 +229,8 @@ class TiledMap:
         return total
 
     def pieces(self, bounds: tuple[Tensor, Tensor] | None = None) -> Iterator[LardHilbertMap]:
-        """The maps of the tiles, one at a time; with the corners of a box only of those that it needs."""
-        return self._local.tile_maps(bounds)
+        """Maps of groups of tiles, one at a time; with the corners of a box only of those it needs."""
+        return self._local.pieces(bounds)
 
     def merge(self, bounds: tuple[Corner, Corner] | None = None) -> LardHilbertMap:
         """An ordinary map, in memory, that equals this map in a box.

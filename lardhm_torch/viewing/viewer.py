@@ -6,6 +6,7 @@ Coordinates on the page are relative to the middle of the map, in float32.
 
 from __future__ import annotations
 
+import atexit
 import os
 import threading
 from dataclasses import dataclass
@@ -24,8 +25,9 @@ from lardhm_torch.surfaces.vertex_colors import COLORS, has_variance
 from lardhm_torch.viewing.legends import legend_html
 from lardhm_torch.viewing.scene import Stage, core_box, view_resolution
 
+BELOW = -0.2  # [m] height of the probabilities of a flat map, which would cut its hits and sensors
 CLOSING = 1.0  # [s] at most that `close` waits for what is being drawn
-DRAFT = 2.0  # cells of the first surface after a change over those of the final one
+DRAFT = 2.5  # cells of the first surface after a change over those of the final one
 EXPORT_SUFFIXES = (".html", ".viser")
 THRESHOLD_HINT = (
     "The surface stays on the hits. A higher threshold removes parts of which the map is less certain "
@@ -136,6 +138,8 @@ class MapViewer:
             self._closed = True
             self._changed.notify_all()
         self._worker.join(CLOSING)
+        if self._worker.is_alive():  # the interpreter must not end while it runs native code
+            atexit.register(self._worker.join)
         self.server.stop()
 
     # --- controls ---
@@ -223,7 +227,7 @@ class MapViewer:
     def _draw(self, model: OccupancyMap, jobs: set[str]) -> None:
         """Redraw what the jobs name: "slice", "surface", or "map" for everything."""
         if model.dim == 2:
-            self._stage.draw_slice(model, 0.0 if self._show_slice.value else None, self._core)
+            self._stage.draw_slice(model, BELOW if self._show_slice.value else None, self._core)
             self._status.content = f"{len(model.weights):,} clusters. {self._middle()}"
             return
         if "map" in jobs or not self._lattices:
