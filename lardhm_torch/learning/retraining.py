@@ -23,7 +23,7 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.sampling import UNKNOWN
 
-FRESH = 1 / 4  # fraction of new points above which the weight of a cluster is trained
+FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 256  # clusters that are chosen for training together
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
