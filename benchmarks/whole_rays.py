@@ -3,7 +3,8 @@
 For each set, half of at most ``--rays`` rays train. Of ``--count`` held-out and of as many training
 rays: early, the fraction that `raycast` ends more than 0.5 m before the hit; phantom, those of them
 that end where no hit of the set lies within 0.2 m; late, the fraction that it ends more than 0.5 m
-beyond the hit, or never. Beside them the scores of accuracy.py and the processor time of `fit`.
+beyond the hit, or never. Beside them the scores of accuracy.py and the processor time of sampling and
+`fit`. With ``--clear-rays``, `fit` is given the rays and reshapes clusters that end them early.
 
     python benchmarks/whole_rays.py --data ../shared/data --sets paper_virtual --seeds 0 1 2
 """
@@ -44,13 +45,16 @@ def ray_errors(model: LardHilbertMap, rays: Scans, hits: cKDTree) -> dict[str, f
     }
 
 
-def run_seed(scans: Scans, seed: int, max_rays: int, count: int) -> dict[str, float]:
+def run_seed(
+    scans: Scans, seed: int, max_rays: int, count: int, clear_rays: bool
+) -> dict[str, float]:
     """All figures of one set and seed."""
     rays = protocol_rays(scans, max_rays, seed)
     train, test = split_rays(rays, 0.5, seed)
     before = time.process_time()
     samples = sample_rays(train, seed=seed)
-    model = LardHilbertMap(dim=scans.dim).fit(samples.points, samples.labels, seed=seed)
+    model = LardHilbertMap(dim=scans.dim)
+    model.fit(samples.points, samples.labels, seed=seed, rays=train if clear_rays else None)
     seconds = time.process_time() - before
     model.requires_grad_(False)
     hits = cKDTree(rays.ends.numpy())
@@ -79,6 +83,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--rays", type=int, default=120_000, help="at most so many of a set")
     parser.add_argument("--count", type=int, default=4_000, help="rays cast of each kind")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--clear-rays", action="store_true", help="give the rays to `fit`")
     parser.add_argument("--json", type=Path, default=ROOT / "out" / "whole_rays.json")
     return parser.parse_args()
 
@@ -90,7 +95,8 @@ def main() -> None:
     print(" " * 24 + "".join(column.rjust(13) for column in COLUMNS))
     for name, path in find_sets(arguments.data, arguments.sets).items():
         scans = load_scans(path)
-        rows = [run_seed(scans, s, arguments.rays, arguments.count) for s in arguments.seeds]
+        given = (arguments.rays, arguments.count, arguments.clear_rays)
+        rows = [run_seed(scans, seed, *given) for seed in arguments.seeds]
         mean = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         report["sets"][name] = rows
         print(format_row(name, mean), flush=True)

@@ -22,6 +22,7 @@ from lardhm_torch.learning import (
     posterior,
 )
 from lardhm_torch.learning.changes import changes_map
+from lardhm_torch.learning.clearing import ray_lines
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask
 from lardhm_torch.learning.points import training_points
@@ -31,7 +32,7 @@ from lardhm_torch.learning.state_dicts import file_state
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
 from lardhm_torch.map_queries import MapQueries
 from lardhm_torch.maps import TensorLike
-from lardhm_torch.scans import seeded_generator
+from lardhm_torch.scans import Scans, seeded_generator
 
 
 class LardHilbertMap(MapQueries):
@@ -84,15 +85,15 @@ class LardHilbertMap(MapQueries):
         seed: int = 0,
         max_bytes: int | None = None,
         channels: Channels | None = None,
+        rays: Scans | None = None,
         progress: bool = False,
         config: FitConfig | None = None,
     ) -> LardHilbertMap:
         """Fit the map to labeled points. Existing clusters are discarded.
 
-        Occupied, free and unknown points are clustered separately. The mean and covariance of the
-        points of a cluster determine its center and length scales. Then the weights are trained. With
-        ``max_bytes`` or ``FitConfig(shape_passes=4)``, the map has fewer clusters, and their centers
-        and length scales are trained, too (`scene_clusters`). If anything fails, the map is unchanged.
+        Occupied, free and unknown points are clustered separately. The moments of its points give a
+        cluster its center and length scales. Then the weights are trained. ``max_bytes`` and small maps
+        (`scene_clusters`) train the shapes of fewer clusters, too. If anything fails, nothing changes.
 
         Args:
             points: (N, D) world positions [m].
@@ -104,6 +105,7 @@ class LardHilbertMap(MapQueries):
             max_bytes: instead of ``num_clusters``, the maximum size of the file that `pack` writes.
             channels: additional values of the points by name, such as `Samples.channels`; the clusters
                 accumulate those of the occupied points. They do not affect the occupancy.
+            rays: scans of the points. Clusters that stop their rays early are reshaped (`clearing`).
             progress: show a progress bar on a terminal.
             config: training settings.
 
@@ -112,8 +114,7 @@ class LardHilbertMap(MapQueries):
 
         Raises:
             ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, no points,
-                num_clusters is not a positive integer, max_bytes is too small or given together with
-                num_clusters, or a channel is invalid.
+                num_clusters is not a positive integer, or other invalid or exclusive arguments.
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
@@ -121,14 +122,14 @@ class LardHilbertMap(MapQueries):
         channels = check_channels(channels, len(points), self.centers.device)
         samples = training_points(points, labels, self.centers)
         check_num_clusters(num_clusters)
-        if max_bytes is not None and num_clusters is not None:
-            raise ValueError("num_clusters and max_bytes exclude each other; got both")
+        if max_bytes is not None and not (num_clusters is None and rays is None):
+            raise ValueError("max_bytes and num_clusters or rays exclude each other; got both")
         rng = seeded_generator(seed, "fit", self.centers.device)
         config = config or (FitConfig() if max_bytes is None else SMALL)
         task = FitTask(self.kernel, config, rng, progress)
         finish = partial(channel_sums.fitted, channels=channels, points=points, labels=labels)
         if max_bytes is None:
-            state = fit_scene(samples.points, samples.labels, num_clusters, task)
+            state = fit_scene(*samples[:2], num_clusters, task, ray_lines(rays, samples[2], task))
         else:
             state = fit_size(samples, max_bytes, task, finish, copy.deepcopy(self))
         state, layout = finish(state, origin=samples.origin)

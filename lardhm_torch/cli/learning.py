@@ -103,6 +103,7 @@ def _fit_at_once(arguments: argparse.Namespace) -> None:
         samples.labels,
         seed=arguments.seed,
         channels=samples.channels,
+        rays=scans if arguments.clear_rays else None,
         progress=True,
         **fit_settings(arguments, noise),
     )

@@ -10,10 +10,12 @@ together, so that few clusters are enough.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from torch import Tensor
 
 from lardhm_torch import native
+from lardhm_torch.learning.clearing import cleared
 from lardhm_torch.learning.clustering import (
     POINTS_PER_CLUSTER,
     most_clusters,
@@ -35,6 +37,7 @@ from lardhm_torch.learning.tuning_steps import (
     to_rows,
     tuning_steps,
 )
+from lardhm_torch.native.crossings import Lines
 from lardhm_torch.sampling import UNKNOWN, spread_rows
 
 NATS_PER_PARAMETER = 2.8  # summed loss of the coarse map that is worth a parameter
@@ -47,7 +50,13 @@ UNKNOWN_FACTOR = 0.6  # on `FitConfig.unknown_share`: few clusters get more unkn
 CLASS_RATIOS = (5, 3, 1)  # numbers of occupied, free and unknown clusters
 
 
-def fit_scene(points: Tensor, labels: Tensor, num_clusters: int | None, task: FitTask) -> MapState:
+def fit_scene(
+    points: Tensor,
+    labels: Tensor,
+    num_clusters: int | None,
+    task: FitTask,
+    rays: Lines | None = None,
+) -> MapState:
     """Fit a map; None: as many clusters as the scene needs.
 
     A number that is given, few points, points of one class, and ``FitConfig(shape_passes=0)`` give
@@ -58,9 +67,11 @@ def fit_scene(points: Tensor, labels: Tensor, num_clusters: int | None, task: Fi
         labels: (N,) 1 occupied, 0 free, 1/2 unknown, of the points' dtype.
         num_clusters: total over all classes, or None.
         task: kernel, settings, random generator.
+        rays: of the points, in the map's frame, that the map should not end early; None: any.
     """
     if num_clusters is not None or not is_learnable(labels, task):
-        return fit_clusters(points, labels, num_clusters, task)
+        refine = None if rays is None else partial(cleared, rays=rays)
+        return fit_clusters(points, labels, num_clusters, task, refine)
     return fit_shapes(points, labels, needed_clusters(points, labels, task), task)
 
 
