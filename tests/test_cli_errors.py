@@ -139,6 +139,7 @@ def test_what_are_no_scans_is_an_error_of_one_line(bad, monkeypatch, capsys, com
         ("fit scans.npz -o o.pt --size 100B", "max_bytes must be a whole number"),
         ("fit scans.npz -o o.pt --size 2kB --clusters 9", "exclude each other"),
         ("fit scans.npz -o o.pt --clear-rays --small", "cannot be used with --size"),
+        ("fit scans.npz -o o.pt --clear-rays --tune", "cannot be used with --size"),
         ("fit scans.npz -o o.pt --clear-rays --incremental", "omit --incremental"),
         (
             "fit scans.npz -o o.pt --size 2kB --tune",

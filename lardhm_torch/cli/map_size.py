@@ -92,8 +92,10 @@ def fit_settings(arguments: argparse.Namespace, hit_noise: float) -> dict[str, A
     is_tuned = bool(arguments.tune or arguments.tune_state)
     if is_tuned and (arguments.size is not None or arguments.small):
         raise ValueError("--size and --small cannot be used with --tune, which also trains shapes")
-    if arguments.clear_rays and (arguments.size is not None or arguments.small):
-        raise ValueError("--clear-rays cannot be used with --size and --small, which train shapes")
+    if arguments.clear_rays and (is_tuned or arguments.size is not None or arguments.small):
+        raise ValueError(
+            "--clear-rays cannot be used with --size, --small and --tune: they train shapes"
+        )
     if arguments.small and arguments.clusters is not None:
         raise ValueError("--small cannot be used with --clusters; it chooses the number")
     config = SMALL if arguments.small or arguments.size is not None else FitConfig()

@@ -42,7 +42,6 @@ NEIGHBORS = 8  # the nearest clusters change shape with them
 FEATURE = 0.2  # of one of these clusters at the samples that they are trained on
 PASSES, BATCHES = 3, 16  # of the shapes, over these samples
 SHAPES = TuneConfig(center_rate=0.05, scale_rate=0.05)
-HIT_FACTOR, PLACE_FACTOR = 1.5, 2.0  # on the loss of hits and of places that rays crossed
 WEIGHT_PASSES, WEIGHT_RATE = 2, 0.1  # of the weights, afterwards
 
 
@@ -141,23 +140,18 @@ def end_depths(state: MapState, rays: Lines, kernel: Kernel) -> Tensor:
     if native.supports(state.centers):
         march = (STEP, farthest, OCCUPIED, OCCUPIED, False)
         return native.raycast((rays.starts, rays.ahead), march, parameters, kernel, index)
-    steps = torch.arange(int(farthest / STEP) + 1, device=rays.reach.device)
+    steps = STEP * torch.arange(int(farthest / STEP) + 1, device=rays.reach.device).to(rays.reach)
+    size = max(1, features.QUERY_CHUNK // len(steps))
     ends = []
-    for chunk in every_few(len(rays.reach), max(1, features.QUERY_CHUNK // len(steps))):
-        along = STEP * steps.to(rays.reach)[:, None] * rays.ahead[chunk][:, None]
-        points = (rays.starts[chunk][:, None] + along).to(state.centers)
+    for starts, ahead in zip(rays.starts.split(size), rays.ahead.split(size), strict=True):
+        points = starts[:, None] + steps[:, None] * ahead[:, None]
         odds = native.occupancy(
-            points.flatten(0, 1), *parameters, kernel, probability=False, index=index
-        ).view(points.shape[:2])
-        first = (odds > OCCUPIED).to(torch.uint8).max(dim=1)
-        depths = STEP * first.indices.to(rays.reach)
-        ends.append(torch.where(first.values > 0, depths, torch.inf))
+            points.flatten(0, 1).to(state.centers), *parameters, kernel, probability=False
+        )
+        occupied = odds.view(points.shape[:2]) > OCCUPIED
+        first = steps[occupied.to(torch.uint8).argmax(dim=1)]
+        ends.append(torch.where(occupied.any(dim=1), first, torch.inf))
     return torch.cat(ends)
-
-
-def every_few(count: int, size: int) -> list[slice]:
-    """Slices of so many rows that cover ``count`` rows."""
-    return [slice(start, start + size) for start in range(0, count, size)]
 
 
 def stopping(state: MapState, ends: Tensor, kernel: Kernel) -> Tensor:
@@ -189,17 +183,11 @@ def _reshaped(
     index = native.build_index(state.centers, task.kernel.num_neighbors)
     around = native.nearest_centers(places, state.centers, near.shape[1], index).to(near)
     free = batches.factors[batches.labels == 0]
-    factor = PLACE_FACTOR * (free[0] if len(free) else 1.0)
-    is_hit = batches.labels == 1
+    factor = float(free[0]) if len(free) else 1.0
     columns = (
         torch.cat([batches.points, places]),
         torch.cat([batches.labels, batches.labels.new_zeros(len(places))]),
-        torch.cat(
-            [
-                torch.where(is_hit, HIT_FACTOR * batches.factors, batches.factors),
-                batches.factors.new_ones(len(places)) * factor,
-            ]
-        ),
+        torch.cat([batches.factors, batches.factors.new_full((len(places),), factor)]),
         torch.cat([near, around]),
     )
     count, rng = len(columns[0]), task.rng
