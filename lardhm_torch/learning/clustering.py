@@ -255,7 +255,9 @@ def scan_clusters(classes: list[Tensor]) -> list[int]:
     return [min(chosen, limit) for limit in limits]
 
 
-def choose_num_clusters(points: Tensor, *, fine: bool = False, represented: int = 0) -> int:
+def choose_num_clusters(
+    points: Tensor, *, fine: bool = False, represented: int = 0, share: float = 1.0
+) -> int:
     """Number of clusters per class that `fit` uses for these occupied points.
 
     The number is one per `CELLS_PER_CLUSTER` cells that contain points, so it is proportional to the
@@ -269,14 +271,16 @@ def choose_num_clusters(points: Tensor, *, fine: bool = False, represented: int 
     Args:
         points: (N, D) positions [m].
         fine: use one cluster per `CELLS_PER_SCAN_CLUSTER` cells instead.
-        represented: number of points that these are a sample of, if they are one.
+        represented: number of points that these represent; 0: themselves.
+        share: of all points of the map, for a part of it: dense points of all parts have at most
+            `MAX_CHOSEN` clusters together.
     """
-    size = max(len(points), represented)
+    size = represented or len(points)
     count = count_cells(points, CELL_EDGE)
     few = min(count, max_singletons(size))
     count = max(few, count // (CELLS_PER_SCAN_CLUSTER if fine else CELLS_PER_CLUSTER))
     finest = max(size // POINTS_PER_CLUSTER, few)
-    coarsest = size // DENSE_POINTS
+    coarsest = min(size // DENSE_POINTS, int(share * MAX_CHOSEN))
     return max(1, min(max(count, coarsest), finest, MAX_CHOSEN))
 
 

@@ -96,15 +96,12 @@ def kept_counts(evidence: Tensor) -> Tensor:
     return (~evidence[:, :, 0].isinf()).sum(dim=1)
 
 
-def kept_points(
-    evidence: Tensor, rows: Tensor | None = None, most: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def kept_points(evidence: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The points that some clusters keep.
 
     Args:
         evidence: (M, E, D).
         rows: (Q,) clusters; None: all.
-        most: (M,) int64 maximum number of points of each cluster, the first ones; None: no limit.
 
     Returns:
         (L, D) points, in the order of ``rows``, and (L,) the cluster of each.
@@ -112,8 +109,8 @@ def kept_points(
     if rows is None:
         rows = torch.arange(len(evidence), device=evidence.device)
     if _is_native(evidence):
-        return torch.ops.lardhm.kept_points(evidence, rows, rows[:0] if most is None else most)
-    found = evidence[rows] if most is None else first_points(evidence[rows], most[rows])
+        return torch.ops.lardhm.kept_points(evidence, rows)
+    found = evidence[rows]
     mask = ~found[:, :, 0].isinf()
     return found[mask], rows[mask.nonzero()[:, 0]]
 

@@ -21,7 +21,10 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.sampling import UNKNOWN
 
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
-NARROWEST = 0.03  # [m] standard deviation of kernels here: few points pass through smaller ones
+NARROWEST = (
+    0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones ...
+)
+EXTENT = 0.25  # ... but in a map of small clusters not more than this fraction of their size
 DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
@@ -43,12 +46,21 @@ def doubted(
     """
     if len(known) == 0 or not bool((labels != UNKNOWN).any()):
         return known.doubts
-    kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, NARROWEST))
+    kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
     parameters = (known.centers, known.raw_scale_tril, known.is_occupied, kernel, index)
     hits, free, _ = split_labels(points, labels)
     hit, passed = (feature_sums(part, *parameters) for part in (hits, free))
     doubts = torch.where(hit > HIT, 0, known.doubts + passed)
     return doubts * known.is_occupied
+
+
+def _narrowest(known: MapState) -> float:
+    """Smallest standard deviation of kernels [m].
+
+    Wide kernels of small clusters would meet rays that pass beside a surface.
+    """
+    variances = known.clusters.covariances[known.is_occupied].diagonal(dim1=1, dim2=2).sum(dim=1)
+    return min(NARROWEST, EXTENT * float(variances.median().sqrt())) if len(variances) else 0.0
 
 
 def trust(doubts: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ into their neighbors.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,8 +39,10 @@ from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
+MORE = 1.25  # clusters relative to the number up to which they are divided: above, small ones go
+LEAST = 1 / 32  # of the mean inertia: clusters below it are dissolved if another one is close
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
-MANY = 1.0  # new points relative to the kept ones, above which a cluster's points are regrouped
+MANY = 1 / 4  # new points relative to the kept ones, above which a cluster's points are regrouped
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 
@@ -114,7 +117,9 @@ def regrouped(
     entering = [
         points_where(part, mask) for part, mask in zip(classes, enters.split(sizes), strict=True)
     ]
-    return _reassigned(groups._replace(state=state), entering, alive, len(known), rule.floor)
+    homes = joined[enters].split([len(part) for part in entering])
+    moving = (entering, homes, received - again)
+    return _reassigned(groups._replace(state=state), moving, alive, len(known), rule.floor)
 
 
 def _divide(known: MapState, rule: Rule) -> Groups:
@@ -129,7 +134,8 @@ def _divide(known: MapState, rule: Rule) -> Groups:
         own = (kinds == kind).nonzero().squeeze(1)
         room = max(factor * occupied, len(own)) - len(own)
         found = own[large[own]]
-        found = found[losses[found].argsort(descending=True, stable=True)[:room]]
+        gain = losses[found] * _inertia(known.rows(found), kept_counts(known.evidence)[found])
+        found = found[gain.argsort(descending=True, stable=True)[:room]]
         if kind == 0 and rule.grows and len(own):
             occupied = len(own) + len(found)
         rows.append(found)
@@ -242,6 +248,8 @@ def _nearest(points: Tensor, centers: Tensor) -> Tensor:
 def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     """(M,) mask of the clusters that are not dissolved.
 
+    As in k-means, clusters shall have similar inertia, so the smallest are dissolved.
+
     Args:
         groups: M clusters.
         received: (M,) number of new points.
@@ -250,22 +258,49 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     """
     sizes = groups.sizes + received
     alive = sizes >= (1 if rule.few else MIN_COUNT)
-    occupied = rule.occupied
+    inertia = _inertia(groups.state, groups.sizes, received)
+    most = MORE * rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = groups.rows(kind)
         some = alive[own]
         if not bool(some.any()):
             some = sizes[own] > 0
-        if kind == 0 and rule.grows:
-            occupied = max(occupied, int(some.sum()))
-        added = int((own >= before).sum())
-        limit = max(1, factor * occupied, len(own) - added, added if rule.grows else 0)
-        excess = int(some.sum()) - limit
+        if not rule.few:
+            some &= ~_needless(groups.state.means[own], inertia[own], sizes[own], some)
+        known = int((own < before).sum())
+        limit = int(factor * most) if rule.grows else max(factor * rule.occupied, known)
+        excess = int(some.sum()) - max(1, limit)
         if excess > 0:
-            order = torch.where(some, sizes[own], sizes.amax() + 1).argsort(stable=True)
+            order = torch.where(some, inertia[own], torch.inf).argsort(stable=True)
             some[order[:excess]] = False
+        if kind == 0:
+            most = max(MORE * int(some.sum()), rule.occupied)
         alive[own] = some
     return alive
+
+
+def _inertia(state: MapState, sizes: Tensor, received: Tensor | int = 0) -> Tensor:
+    """(M,) sum of the squared distances of the points of clusters from their means [m^2].
+
+    Args:
+        state: M clusters.
+        sizes: (M,) number of kept points; they stand for themselves if the class is unknown.
+        received: (M,) number of new points.
+    """
+    number = torch.where(state.counts > 0, state.counts, sizes) + received
+    return number * state.clusters.covariances.diagonal(dim1=1, dim2=2).sum(dim=1)
+
+
+def _needless(means: Tensor, inertia: Tensor, sizes: Tensor, some: Tensor) -> Tensor:
+    """(M,) mask of clusters of little inertia whose points another one can take for little more."""
+    mean = inertia[some].mean()
+    found = some & (inertia < LEAST * mean)
+    rows, others = found.nonzero().squeeze(1), (some & ~found).nonzero().squeeze(1)
+    if len(rows) and len(others):
+        nearest = means[others[_nearest(means[rows], means[others])]]
+        cost = sizes[rows] * (means[rows] - nearest).square().sum(dim=1)
+        found[rows] = cost < mean
+    return found
 
 
 def _unseen(groups: Groups, joined: Tensor, again: Tensor) -> Tensor:
@@ -278,19 +313,36 @@ def _unseen(groups: Groups, joined: Tensor, again: Tensor) -> Tensor:
 
 
 def _reassigned(
-    groups: Groups, classes: list[Tensor], alive: Tensor, num_known: int, floor: float
-) -> MapState:
-    """Clusters after new points and all points of changed clusters went to the nearest centers."""
+    groups: Groups, entering: tuple[list[Tensor], Sequence[Tensor], Tensor], alive: Tensor,
+    num_known: int, floor: float,
+) -> MapState:  # fmt: skip
+    """Clusters after new points and all points of changed clusters went to the nearest centers.
+
+    The points of changed clusters take along an equal part of the count each.
+
+    Args:
+        groups: M clusters.
+        entering: new points of each class, (N, D) each [m]; their clusters; (M,) their numbers.
+        alive: (M,) bool: the others are dissolved.
+        num_known: number of clusters that are not new, the first ones.
+        floor: smallest standard deviation [m].
+    """
     state, evidence, changed = groups.state, groups.evidence, groups.changed
     points, owners = [evidence[:0, 0]], [torch.empty_like(groups.kinds[:0])]
-    for kind, new in enumerate(classes):
+    carried = (state.counts / (groups.sizes + entering[2]).clamp(min=1)).double() * changed
+    counts = state.counts.double().masked_fill(changed, 0)
+    for kind, (new, joined) in enumerate(zip(*entering[:2], strict=True)):
         rows = (alive & (groups.kinds == kind)).nonzero().squeeze(1)
         if len(rows) == 0:
             continue
         regrouped = changed & (groups.kinds == kind)
-        kept, _ = kept_points(evidence, regrouped[: len(evidence)].nonzero().squeeze(1))
+        kept, homes = kept_points(evidence, regrouped[: len(evidence)].nonzero().squeeze(1))
         points.append(torch.cat([new, kept]))
         owners.append(rows.index_select(0, _nearest(points[-1], state.means[rows])))
+        if kind < 2:
+            counts.index_add_(0, owners[-1], carried[torch.cat([joined, homes])])
+    counts = torch.where(groups.kinds < 2, counts.round().clamp(min=1), 0).to(state.counts)
+    state = replace(state, counts=counts, scatters=_rescaled(state, counts))
     evidence, new = add_points(evidence, changed, torch.cat(points), torch.cat(owners))
     sizes = kept_counts(evidence)
     lost = (groups.sizes + new - sizes).clamp(min=0)

@@ -23,10 +23,9 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.sampling import UNKNOWN
 
-FRESH = 1 / 4  # fraction of new points above which the weight of a cluster is trained
+FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
 BLOCK = 256  # clusters that are chosen for training together
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
-BESIDE = 8  # clusters with fixed weights constrain others with so many of their points
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
 
@@ -38,8 +37,8 @@ def retrained(
 
     A cluster has changed if more than `FRESH` of its kept points are new.
 
-    Some of the evidence of the neighbors of those constrains them, too. ``losses`` of the trained
-    clusters are updated.
+    The evidence of the neighbors of those constrains them, too. ``losses`` of the trained clusters are
+    updated.
 
     Args:
         state: M clusters.
@@ -57,10 +56,9 @@ def retrained(
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
-    used = torch.where(moving, kept, kept.clamp(max=BESIDE))
-    points, owners = kept_points(state.evidence, rows, used)
+    points, owners = kept_points(state.evidence, rows)
     sizes = torch.bincount(owners, minlength=len(state))
-    strength = evidence_weights(state, kept) * (kept / used.clamp(min=1))
+    strength = evidence_weights(state, kept)
     factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
     factors = factors.index_select(0, owners)
@@ -172,13 +170,9 @@ def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor)
 
 
 def evidence_weights(state: MapState, kept: Tensor) -> Tensor:
-    """(M,) weight of each kept point of a cluster.
-
-    A kept point represents count / kept points. Its weight is the square root of that, between one
-    weight for each point that was seen and one for each point that is kept.
-    """
+    """(M,) weight of each kept point of a cluster: the number of points that it represents."""
     represented = state.counts / kept.clamp(min=1)
-    return represented.clamp(min=1).sqrt().to(state.weights)
+    return represented.clamp(min=1).to(state.weights)
 
 
 def balanced(

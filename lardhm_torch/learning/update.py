@@ -36,7 +36,6 @@ from lardhm_torch.learning.retraining import balanced, retrained, trained
 from lardhm_torch.native.thinning import few_per_cell
 from lardhm_torch.sampling import UNKNOWN
 
-MORE = 1.25  # clusters relative to `fit`: those divided one by one are placed less well
 UNDECIDED = 0.1  # distance of a probability from 1/2 within which a place is still unknown
 BOX_STDS = 2.0  # half-width of a kernel, in standard deviations, to select clusters near a scan
 UPDATE_FIT = FitConfig(passes=2, batch_size=1024)
@@ -112,7 +111,8 @@ def updated(
     before = part.doubts
     part = replace(part, doubts=doubted(part, points, labels, kernel, index))
     part, classes = forget(part, before), tuple(split_labels(points, labels))
-    occupied, grows = _most_occupied(part, classes[0], num_clusters), num_clusters is None
+    total = int(state.counts[state.is_occupied].sum())
+    occupied, grows = _most_occupied(part, classes[0], num_clusters, total), num_clusters is None
     rule = Rule(occupied, grows, few, config.split_loss, kernel.min_lengthscale)
     part = regrouped(part, classes, rule, rng)
     alive = keeps_points(part.evidence)
@@ -171,18 +171,18 @@ def _still_unknown(
     return points_where(points, kept), labels[kept]
 
 
-def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None) -> int:
+def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None, total: int) -> int:
     """Number of occupied clusters up to which those near a scan are divided.
 
     It is the number that `clustering.choose_num_clusters` gives for the points that they have received.
+    ``total`` is the number of hits that the whole map has received before.
     """
     if num_clusters is not None:
         return num_clusters // 4
     kept, _ = kept_points(part.evidence, part.is_occupied.nonzero().squeeze(1))
-    if len(kept) == 0:
-        return choose_num_clusters(hits)
-    represented = int(part.counts[part.is_occupied].sum())
-    return int(MORE * choose_num_clusters(kept, represented=represented))
+    size = max(int(part.counts[part.is_occupied].sum()), len(hits))  # most hits may be known
+    share = size / max(1, total, len(hits))
+    return choose_num_clusters(torch.cat([kept, hits]), represented=size, share=share)
 
 
 def _as_in_paper(

@@ -76,14 +76,9 @@ Tensor kept_counts(const Tensor& given) {
   return counts;
 }
 
-// The points of some clusters; of each at most `most`, which may be empty.
-Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows, const Tensor& given_most) {
-  const Tensor evidence = tidy(given), rows = tidy(given_rows), limits = tidy(given_most);
-  check(rows.scalar_type() == ScalarType::Long && limits.scalar_type() == ScalarType::Long,
-        "rows and most must be int64");
-  check(limits.numel() == 0 || limits.numel() == evidence.size(0),
-        "most must be (M,), one per cluster");
-  const int64_t* most = limits.numel() ? in<int64_t>(limits) : nullptr;
+Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows) {
+  const Tensor evidence = tidy(given), rows = tidy(given_rows);
+  check(rows.scalar_type() == ScalarType::Long, "rows must be int64");
   const int64_t count = rows.numel(), size = evidence.size(1);
   for (int64_t i = 0; i < count; ++i)
     check(in<int64_t>(rows)[i] >= 0 && in<int64_t>(rows)[i] < evidence.size(0),
@@ -94,10 +89,8 @@ Tensors<2> kept_points(const Tensor& given, const Tensor& given_rows, const Tens
     using T = decltype(type);
     constexpr int D = dim();
     const T* all = in<T>(evidence);
-    for (int64_t i = 0; i < count; ++i) {
-      const int64_t row = in<int64_t>(rows)[i], kept = count_kept<T, D>(all + row * size * D, size);
-      first[i + 1] = first[i] + (most ? std::max<int64_t>(0, std::min(kept, most[row])) : kept);
-    }
+    for (int64_t i = 0; i < count; ++i)
+      first[i + 1] = first[i] + count_kept<T, D>(all + in<int64_t>(rows)[i] * size * D, size);
     points = new_empty(evidence, {first[count], D});
     owners = new_empty(evidence, {first[count]}, ScalarType::Long);
     for_rows(count, [&](int64_t i) {
@@ -305,8 +298,7 @@ Tensors<2> halves(const Tensor& given) {
 std::vector<Operator> kept_operators() {
   return {
       {"kept_counts(Tensor evidence) -> Tensor", &boxed<kept_counts>},
-      {"kept_points(Tensor evidence, Tensor rows, Tensor most) -> (Tensor, Tensor)",
-       &boxed<kept_points>},
+      {"kept_points(Tensor evidence, Tensor rows) -> (Tensor, Tensor)", &boxed<kept_points>},
       {"kept_again(Tensor points, Tensor owners, Tensor evidence, Tensor cleared) -> (Tensor, Tensor)",
        &boxed<kept_again>},
       {"halves(Tensor evidence) -> (Tensor, Tensor)", &boxed<halves>},
