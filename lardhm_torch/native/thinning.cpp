@@ -80,7 +80,7 @@ class Numbers {
   }
 };
 
-// Working memory of a thread: cell numbers of a bucket's rows, and the rows cell by cell.
+// Cell numbers of the rows of a bucket, and these rows cell by cell.
 struct Bucket {
   Numbers numbers;
   std::vector<int32_t> owners, first, rows;
@@ -130,7 +130,7 @@ std::vector<char> chosen_rows(const T* points, const int64_t* groups, int64_t n,
   const Buckets buckets(cells);
   std::vector<char> is_chosen(n, 1);
   run_tasks(buckets.count, [&](int64_t b) {
-    static thread_local Bucket own;
+    Bucket own;
     own.divide(cells, buckets.rows.data() + buckets.first[b],
                buckets.first[b + 1] - buckets.first[b]);
     for (int32_t m = 0; m < own.numbers.count; ++m)
@@ -179,7 +179,7 @@ int64_t count_cells(const Tensor& given_points, double edge) {
     });
     const Buckets buckets(cells);
     run_tasks(buckets.count, [&](int64_t b) {
-      static thread_local Numbers numbers;
+      Numbers numbers;
       const int64_t first = buckets.first[b], end = buckets.first[b + 1];
       numbers.clear(end - first);
       for (int64_t i = first; i < end; ++i) numbers.of(cells[buckets.rows[i]]);
