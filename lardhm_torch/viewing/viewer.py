@@ -28,6 +28,7 @@ from lardhm_torch.viewing.scene import Stage, core_box, view_resolution
 BELOW = -0.2  # [m] height of the probabilities of a flat map, which would cut its hits and sensors
 CLOSING = 1.0  # [s] at most that `close` waits for what is being drawn
 DRAFT = 2.5  # cells of the first surface after a change over those of the final one
+SETTLED = 0.4  # [s] without a change before the final surface is begun; the page draws the first
 EXPORT_SUFFIXES = (".html", ".viser")
 THRESHOLD_HINT = (
     "The surface stays on the hits. A higher threshold removes parts of which the map is less certain "
@@ -238,15 +239,18 @@ class MapViewer:
             height = float(self._height.value) if self._show_slice.value else None
             self._stage.draw_slice(model, height, self._core)
         if jobs & {"map", "surface"}:
-            for lattice, is_final in zip(self._lattices, (False, True), strict=True):
-                self._report = self._draw_surface(model, lattice, is_final)
+            draft, final = self._lattices
+            self._report = self._draw_surface(model, draft, is_final=False)
+            with self._changed:
+                self._changed.wait_for(self._is_outdated, timeout=SETTLED)
+            self._report = self._draw_surface(model, final, is_final=True)
         self._status.content = self._report
 
     def _draw_surface(self, model: OccupancyMap, lattice: Lattice | None, is_final: bool) -> str:
         """Show the surface; returns the status line. A final one gives way to a change of a control."""
 
         def check(_: int = 0) -> None:
-            if self._closed or (is_final and "surface" in self._jobs):
+            if self._closed or (is_final and self._is_outdated()):
                 raise _OutdatedError
 
         color = self._color.value
@@ -265,6 +269,10 @@ class MapViewer:
             f"{shown:,} shown, cells of {lattice.resolution if lattice else 0:.3g} m. "
             f"{self._middle()}"
         )
+
+    def _is_outdated(self) -> bool:
+        """Whether a change makes the surface that is being drawn needless."""
+        return self._closed or "surface" in self._jobs
 
     def _middle(self) -> str:
         return f"Middle of the map: ({', '.join(f'{v:g}' for v in self.offset)}) m"
