@@ -42,7 +42,7 @@ JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others
 MORE = 1.25  # clusters relative to the number up to which they are divided: above, small ones go
 LEAST = 1 / 32  # of the mean inertia: clusters below it are dissolved if another one is close
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
-MANY = 1 / 4  # new points relative to the kept ones, above which a cluster's points are regrouped
+MANY = 1.0  # new points relative to the kept ones, above which a cluster's points are regrouped
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
 
