@@ -102,9 +102,10 @@ def test_a_faded_obstacle_in_free_space_does_not_count():
 
 def test_tiles_have_the_clearance_of_the_whole_map(tmp_path, monkeypatch):
     model = fitted_map().double()
+    with torch.no_grad():  # tiles round centers, which can move a face across a threshold
+        model.centers.copy_((4096 * model.centers).round() / 4096)
+        model.origin.copy_((4096 * model.origin).round() / 4096)
     tiles = tiled(model, tmp_path, monkeypatch, edge=2.0)
     points = 4 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     whole, found = clearance(model, points), clearance(tiles, points)
-    # centers are rounded in tiles, by less than 1e-7 m, which can move one face across a threshold
-    assert float((found - whole).abs().median()) < 1e-4
-    assert float(((found - whole).abs() < 1e-4).double().mean()) > 0.9
+    torch.testing.assert_close(found, whole, rtol=0, atol=1e-4)

@@ -320,7 +320,7 @@ def test_the_mesh_of_a_room_lies_on_its_walls():
         surface: mesh_metrics(mesh, room_mesh(), train.hits) for surface, mesh in meshes.items()
     }
     assert meshes["peak"].area == pytest.approx(158.5, rel=0.05)  # what the sensors can see of it
-    assert facing_away(meshes["peak"], room_mesh()) < 0.02  # .012 to .017 over three seeds
+    assert facing_away(meshes["peak"], room_mesh()) < 0.015
     assert scores["peak"]["f_score_0.05"] > 0.85
     assert scores["peak"]["chamfer"] < 0.5 * scores["crossing"]["chamfer"]
 

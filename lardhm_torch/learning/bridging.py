@@ -115,9 +115,8 @@ def find_plates(surfaces: MapState, floor: float) -> Plates:
     across = normals[:, :, None] * normals[:, None]  # (M, D, D)
     eye = torch.eye(centers.shape[1]).to(centers)
     inside = (eye - across) @ covariances @ (eye - across)
-    spread, axes = native.symmetric_axes(
-        inside - across
-    )  # the normal has the only negative eigenvalue
+    # the normal has the only negative eigenvalue
+    spread, axes = native.symmetric_axes(inside - across)
     spread[:, 0] = (normals[:, None] @ covariances @ normals[:, :, None]).flatten()
     extents = (spread.clamp(min=0) + floor**2).sqrt()
     patch = (variances.clamp(min=0) + floor**2).sqrt()

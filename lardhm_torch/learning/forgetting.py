@@ -21,10 +21,8 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.sampling import UNKNOWN
 
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
-NARROWEST = (
-    0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones ...
-)
-EXTENT = 0.25  # ... but in a map of small clusters not more than this fraction of their size
+NARROWEST = 0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones
+EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
 DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
