@@ -47,7 +47,7 @@ class UpdateConfig:
 
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance between merged clusters in Algorithm 2
-    split_loss: float = 0.01  # clusters whose points have a larger mean log-loss are divided
+    split_loss: float = 0.003  # clusters whose points have a larger mean log-loss are divided
     cell_edge: float = 0.05  # [m] in a cell of this edge, at most 4 new points of a class are used
     max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
     max_trained: int = 5_000  # maximum number of changed clusters to train; the others follow later
