@@ -25,6 +25,7 @@ from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clearing import ray_lines
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask
+from lardhm_torch.learning.passing import lines_of
 from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.scene_clusters import fit_scene
 from lardhm_torch.learning.sized_maps import SMALL, fit_size
@@ -270,6 +271,7 @@ class LardHilbertMap(MapQueries):
         seed: int = 0,
         channels: Channels | None = None,
         time: float | None = None,
+        rays: Scans | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
         """Update the map with one more scan. On an empty map this is `fit`.
@@ -287,6 +289,7 @@ class LardHilbertMap(MapQueries):
             seed: random seed of clustering and training.
             channels: see `fit`; channels and classes that are new to the map are added to it.
             time: time stamp of the scan [s]; required if the map has a ``max_age``.
+            rays: the scan of the points; obstacles that its rays pass through disappear sooner.
             config: update settings; `UpdateConfig(as_in_paper=True)` selects Algorithm 2 of the paper.
 
         Returns:
@@ -313,7 +316,8 @@ class LardHilbertMap(MapQueries):
         hits = channel_sums.hits_with_channels(*samples[:2], channels)
         state = parameters.read_state(self)
         state, layout = channel_sums.with_layout_of(hits, state, self.channel_layout)
-        changes = updated(state, *samples[:2], num_clusters, task)
+        lines = None if rays is None else lines_of(rays, self.origin)
+        changes = updated(state, *samples[:2], num_clusters, task, lines)
         part = channel_sums.with_hits(changes.part, layout, hits)
         part = aging.timed(part, *samples[:2], self.kernel, time)
         parameters.write_rows(self, changes.where, part, changes.removed, layout)

@@ -25,11 +25,12 @@ NARROWEST = 0.03  # [m] smallest standard deviation of kernels here: few points 
 EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
 DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
+URGENT = 1000  # clusters whose trust changed are trained before others
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
 
 
 def doubted(
-    known: MapState, points: Tensor, labels: Tensor, kernel: Kernel, index: Tensor
+    known: MapState, points: Tensor, labels: Tensor, kernel: Kernel, index: Tensor, passed: Tensor | None = None
 ) -> Tensor:
     """(M,) free points at the center of each occupied cluster since its last hit.
 
@@ -47,8 +48,12 @@ def doubted(
     kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
     parameters = (known.centers, known.raw_scale_tril, known.is_occupied, kernel, index)
     hits, free, _ = split_labels(points, labels)
-    hit, passed = (feature_sums(part, *parameters) for part in (hits, free))
-    doubts = torch.where(hit > HIT, 0, known.doubts + passed)
+    hit = feature_sums(hits, *parameters)
+    if passed is None:
+        more = feature_sums(free, *parameters)
+    else:
+        more = torch.bincount(passed, minlength=len(known))
+    doubts = torch.where(hit > HIT, 0, known.doubts + more)
     return doubts * known.is_occupied
 
 
@@ -86,5 +91,5 @@ def forget(known: MapState, before: Tensor) -> MapState:
         known,
         evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
-        fresh=known.fresh.index_copy(0, rows, kept.to(known.fresh)),
+        fresh=known.fresh.index_copy(0, rows, (URGENT * kept).to(known.fresh)),
     )
