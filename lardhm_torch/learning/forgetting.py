@@ -45,12 +45,12 @@ def doubted(
     """
     if len(known) == 0 or not bool((labels != UNKNOWN).any()):
         return known.doubts
-    kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
-    parameters = (known.centers, known.raw_scale_tril, known.is_occupied, kernel, index)
     hits, free, _ = split_labels(points, labels)
-    hit = feature_sums(hits, *parameters)
+    wide = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
+    shapes = (known.centers, known.raw_scale_tril, known.is_occupied)
+    hit = feature_sums(hits, *shapes, wide._replace(covariance_scale=1.0), index)
     if passed is None:
-        more = feature_sums(free, *parameters)
+        more = feature_sums(free, *shapes, wide, index)
     else:
         more = torch.bincount(passed, minlength=len(known))
     doubts = torch.where(hit > HIT, 0, known.doubts + more)

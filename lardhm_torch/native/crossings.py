@@ -21,6 +21,7 @@ PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
 PATCH_HITS = 16  # a patch has so many hits, and fewer than twice as many
 NEAR = 2.5  # standard deviations of a patch: nearer rays pass through it
 CORE = 1.5  # standard deviations of a cluster: rays that come so near pass through it
+THIN = 0.002  # [m] smallest standard deviation of a cluster: rays pass beside thin poles
 FLOOR = 0.01  # [m] smallest standard deviation of a patch
 FLAT = 0.3  # thickness of a flat patch, relative to its second largest extent
 ROUGH_PATCHES = 1024  # number of patches from which the scatter of hits is estimated
@@ -113,12 +114,12 @@ def find_patches(hits: Tensor) -> Patches:
     return patches_of(means, scatters / (sizes - 1).clamp(min=1)[:, None, None])
 
 
-def patches_of(means: Tensor, covariances: Tensor) -> Patches:
-    """Patches with (L, D) means [m] and (L, D, D) covariances [m^2], to which a floor is added."""
+def patches_of(means: Tensor, covariances: Tensor, floor: float = FLOOR) -> Patches:
+    """Patches with (L, D) means [m] and (L, D, D) covariances [m^2], to which ``floor``^2 is added."""
     eye = torch.eye(means.shape[1], dtype=means.dtype, device=means.device)
-    covariances = covariances + FLOOR**2 * eye
+    covariances = covariances + floor**2 * eye
     variances, axes = native.symmetric_axes(covariances)
-    variances = variances.clamp(min=FLOOR**2)
+    variances = variances.clamp(min=floor**2)
     spread = variances.sqrt()
     precisions = (axes / variances[:, None]) @ axes.mT
     is_flat = spread[:, 0] < FLAT * spread[:, 1]
@@ -211,13 +212,20 @@ def passages_through(
     levels = (len(means) - 1).bit_length()
     bounds = torch.arange((1 << levels) + 1, device=means.device) * len(means) >> levels
     order = balanced_order(means, levels)[bounds[:-1]]  # a leaf without a cluster gets the next one
-    patches = patches_of(means[order], covariances[order])
+    means, covariances = means[order], covariances[order]
+    patches = patches_of(means, covariances)
     clear = torch.where(patches.is_flat, NEAR * patches.thickness + margin, -torch.inf)
-    rays, leaves = crossed(patches, lines, ends, clear, CORE)
-    own = (bounds.diff() > 0)[leaves]
-    rays, leaves = rays[own], leaves[own]
+    thin = patches_of(means, covariances, THIN)
+    cores = patches._replace(precisions=thin.precisions, covariances=thin.covariances)
+    rays, leaves = crossed(cores, lines, ends, clear, CORE)
     depths, widths, _ = _closest(rays, leaves, lines, patches)
-    return order[leaves], Passages(rays, depths, widths, patches.is_flat[leaves])
+    steep = (lines.ahead[rays] * patches.normals[leaves]).sum(dim=1) / patches.thickness[leaves]
+    is_flat = patches.is_flat[leaves]
+    through = ~is_flat | ((steep * widths) ** 2 > 0.5)  # else it grazes the plane
+    through &= (bounds.diff() > 0)[leaves]
+    found = (order[leaves], rays, depths, widths, is_flat)
+    clusters, *columns = (column[through] for column in found)
+    return clusters, Passages(*columns)
 
 
 def _none(ends: Tensor) -> Passages:
