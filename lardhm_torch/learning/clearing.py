@@ -61,7 +61,7 @@ def ray_lines(scans: Scans | None, origin: Tensor, task: FitTask) -> Lines | Non
     """
     if scans is not None and task.config.shape_passes:
         raise ValueError("rays must be None if config.shape_passes is not 0; got both")
-    return None if scans is None else lines_of(scans, origin)
+    return lines_of(scans, origin)
 
 
 def cleared(state: MapState, samples: Batched, task: FitTask, rays: Lines) -> MapState:

@@ -25,16 +25,18 @@ from lardhm_torch.sampling import SamplingConfig, usable_rays
 from lardhm_torch.scans import Scans
 
 
-def lines_of(scans: Scans, origin: Tensor) -> Lines:
+def lines_of(scans: Scans | None, origin: Tensor) -> Lines | None:
     """The rays of scans in the frame of a map, as far as they were seen to go.
 
     Args:
-        scans: later returns and rays that are not sampled are left out.
+        scans: later returns and rays that are not sampled are left out. None: no rays, None.
         origin: (D,) float64, the map's origin [m].
 
     Raises:
         ValueError: the scans do not have the dimension of the map.
     """
+    if scans is None:
+        return None
     if scans.dim != len(origin):
         raise ValueError(f"rays must have the {len(origin)} dimensions of the map; got {scans.dim}")
     limits = SamplingConfig()

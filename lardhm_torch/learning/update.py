@@ -122,9 +122,9 @@ def updated(
     else:
         passed, places = passed_clusters(part, rays)
         part = replace(part, doubts=doubted(part, points, labels, kernel, index, passed))
+        part = still_unknown(part, rays, kernel.min_lengthscale)
         gone = points_where(places, trust(part.doubts)[passed] < 1)
         points, labels = torch.cat([points, gone]), torch.cat([labels, labels.new_zeros(len(gone))])
-        part = still_unknown(part, rays, kernel.min_lengthscale)
     part, classes = forget(part, before), tuple(split_labels(points, labels))
     total = int(state.counts[state.is_occupied].sum())
     occupied, grows = _most_occupied(part, classes[0], num_clusters, total), num_clusters is None

@@ -218,14 +218,14 @@ def passages_through(
     thin = patches_of(means, covariances, THIN)
     cores = patches._replace(precisions=thin.precisions, covariances=thin.covariances)
     rays, leaves = crossed(cores, lines, ends, clear, CORE)
-    depths, widths, _ = _closest(rays, leaves, lines, patches)
+    depths = _closest(rays, leaves, lines, cores)[0]
+    widths = _closest(rays, leaves, lines, patches)[1]
     steep = (lines.ahead[rays] * patches.normals[leaves]).sum(dim=1) / patches.thickness[leaves]
     is_flat = patches.is_flat[leaves]
     through = ~is_flat | ((steep * widths) ** 2 > 0.5)  # else it grazes the plane
     through &= (bounds.diff() > 0)[leaves]
-    found = (order[leaves], rays, depths, widths, is_flat)
-    clusters, *columns = (column[through] for column in found)
-    return clusters, Passages(*columns)
+    columns = (rays, depths, widths, is_flat)
+    return order[leaves][through], Passages(*(column[through] for column in columns))
 
 
 def _none(ends: Tensor) -> Passages:
