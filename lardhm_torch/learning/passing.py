@@ -24,6 +24,8 @@ from lardhm_torch.native.crossings import Lines, never_crossed, passages_through
 from lardhm_torch.sampling import SamplingConfig, usable_rays
 from lardhm_torch.scans import Scans
 
+FEW_RAYS = 4096  # of many rays, fewer than twice as many are compared with unknown points
+
 
 def lines_of(scans: Scans | None, origin: Tensor) -> Lines | None:
     """The rays of scans in the frame of a map, as far as they were seen to go.
@@ -72,8 +74,9 @@ def still_unknown(known: MapState, rays: Lines, floor: float) -> MapState:
     """
     unknown = (known.kinds == 2).nonzero().squeeze(1)
     points, owners = kept_points(known.evidence, unknown)
-    limits = SamplingConfig()
-    free = rays._replace(reach=rays.reach - limits.near_margin)
+    limits, every = SamplingConfig(), max(1, len(rays.reach) // FEW_RAYS)
+    starts = rays.starts if len(rays.starts) == 1 else rays.starts[::every]
+    free = (starts, rays.ahead[::every], rays.reach[::every] - limits.near_margin)
     kept = never_crossed(points.double(), *free, limits.cell_edge)
     touched = owners[~kept].unique()
     if len(touched) == 0:
