@@ -17,7 +17,6 @@ from lardhm_torch.learning.forgetting import (
     DOUBT,
     GONE,
     OVERRULED,
-    RAY,
     URGENT,
     doubted,
     forget,
@@ -145,17 +144,18 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     assert (trust(nothing_there.doubts) == 1).all()
 
 
-def test_rays_through_a_cluster_count_until_it_is_hit():
+def test_scans_with_rays_through_a_cluster_count_until_it_is_hit():
     known, kernel = known_wall(), LardHilbertMap().kernel
     index = native.build_index(known.centers, kernel.num_neighbors)
     free = known.centers + torch.tensor([9.0, 0, 0], dtype=F64)
     passed = torch.tensor([1, 1, 3])
     doubts = doubted(known, free, torch.zeros(4), kernel, index, passed)
-    assert torch.equal(doubts, RAY * torch.tensor([0.0, 2, 0, 1], dtype=F64))
+    once = 3 * DOUBT / (4 + known.counts.double()).log2()
+    torch.testing.assert_close(doubts, once * torch.tensor([0.0, 1, 0, 1], dtype=F64))
     known = replace(known, doubts=doubts)
     hit = doubted(known, known.means[1:2], torch.ones(1), kernel, index, passed)
     assert hit[1] == 0
-    assert hit[3] == 2 * RAY
+    torch.testing.assert_close(hit[3], 2 * once[3])
 
 
 def forgetting_state(known, points, labels, kernel):

@@ -1,10 +1,10 @@
 """Forgetting: kept points that a new scan contradicts.
 
-For each occupied cluster, the rays that pass through it since its last hit are counted (``doubts``), or
-the free points near its center if the rays are not known. Above `DOUBT`, its kept points have less
-weight in training, so a removed obstacle disappears after a few scans, no matter how long it was observed
-before. A hit restores the weight. Points of unknown clusters are removed if the map predicts them as free
-or occupied.
+For each occupied cluster, the scans with rays that pass through it since its last hit are counted, or
+the free points near its center if the rays are not known. ``doubts`` is that count relative to a third of
+the binary logarithm of the number of its hits. Above `DOUBT`, the kept points have less weight in training,
+so a removed obstacle disappears after a few scans, a little later if it was observed for long. A hit
+restores the weight. Points of unknown clusters are removed if the map predicts them as free or occupied.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ from lardhm_torch.sampling import UNKNOWN
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
 NARROWEST = 0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones
 EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
-RAY = 0.5  # a ray through a cluster, compared with a free point at its center
-DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
+CONFIRMS = 2.0  # covariance scale of kernels for hits if rays are known: hits beside do not confirm
+POINT = (
+    2 / 3
+)  # a free point at the center of a cluster, compared with a scan that passed through it
+DOUBT = 3.0  # doubt at which a cluster is contradicted
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
 URGENT = 1000  # clusters whose trust changed are trained before others
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
@@ -41,8 +44,9 @@ def doubted(
 ) -> Tensor:
     """(M,) evidence against each occupied cluster since its last hit.
 
-    A ray that passed through it counts as `RAY`. If the rays are not known, free points are counted, each
-    with its feature, which is 1 at the center of a cluster and falls to 0.
+    A scan with rays that passed through it counts 1. If the rays are not known, each free point counts
+    `POINT` times its feature, which is 1 at the center of a cluster and falls to 0. `DOUBT` is reached
+    when the count is a third of the binary logarithm of 4 plus the cluster's hits.
 
     Args:
         known: M clusters.
@@ -58,11 +62,13 @@ def doubted(
     wide = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
     shapes = (known.centers, known.raw_scale_tril, known.is_occupied)
     if passed is None:
-        hit, more = (feature_sums(part, *shapes, wide, index) for part in (hits, free))
+        hit = feature_sums(hits, *shapes, wide, index)
+        more = POINT * feature_sums(free, *shapes, wide, index)
     else:
-        hit = feature_sums(hits, *shapes, wide._replace(covariance_scale=1.0), index)
-        more = RAY * torch.bincount(passed, minlength=len(known))
-    doubts = torch.where(hit > HIT, 0, known.doubts + more)
+        hit = feature_sums(hits, *shapes, wide._replace(covariance_scale=CONFIRMS), index)
+        more = torch.zeros_like(hit).index_fill_(0, passed, 1)
+    tolerance = (4 + known.counts).log2().to(more) / 3
+    doubts = torch.where(hit > HIT, 0, known.doubts + DOUBT * more / tolerance)
     return doubts * known.is_occupied
 
 
