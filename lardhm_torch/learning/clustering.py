@@ -24,8 +24,8 @@ DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the n
 CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] grid cells, and occupied cells per cluster
 CELLS_PER_SCAN_CLUSTER = 1  # the same in `scan_clusters`
 MAX_CHOSEN = 5000  # upper bound per class in `choose_num_clusters`
-FIT_ITERATIONS = 15  # of k-means, of occupied points
-VOLUME_ITERATIONS = 5  # the same of free and unknown points, if there are unknown points
+FIT_ITERATIONS = 8  # of k-means, of occupied points
+VOLUME_ITERATIONS = 3  # the same of free and unknown points, if there are unknown points
 FEW_POINTS = 64  # classes up to this size may have one cluster per point
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
@@ -163,7 +163,7 @@ def class_ratios(num_unknown: int) -> tuple[int, int, int]:
     With unknown points, free space gets twice as many clusters, because it must end where unknown
     space begins.
     """
-    return (1, 2, 1) if num_unknown else (1, 1, 0)
+    return (1, 1, 1) if num_unknown else (1, 1, 0)
 
 
 def cluster_each(classes: list[Tensor], totals: Sequence[int], rng: torch.Generator) -> Grouped:

@@ -31,9 +31,9 @@ FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 class FitConfig:
     """Training settings of the weights.
 
-    The defaults train to convergence. The settings of the paper, one pass at a constant learning rate
-    without preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False,
-    preconditioner=False, batch_size=1)``; the log-loss is then higher (see docs and benchmarks).
+    The settings of the paper, one pass over the weights at a constant learning rate without
+    preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False, preconditioner=False,
+    batch_size=1, adapt_shapes=False)``; the log-loss is then higher (see docs and benchmarks).
     """
 
     passes: int | None = None  # passes over all points; None: 4, or more to reach `MIN_STEPS` steps
@@ -46,16 +46,18 @@ class FitConfig:
     balance: bool = True  # weight the classes independently of their numbers of points
     # Class weight of occupied points, as a fraction of the loss, if classes are balanced. It exceeds
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
-    occupied_share: float = 0.6
+    occupied_share: float = 0.55
     unknown_share: float = 0.25  # weight of the loss of unknown points, relative to all others
     bridge_gaps: bool = True  # extend surfaces across gaps that no ray crossed (`bridging`)
     # [m] standard deviation of random displacements of hits while the weights are trained. Surfaces are
     # then as thick as scans disagree (`scan_disagreement`), for queries at the poses of other scans.
     hit_noise: float = 0.0
-    # passes that also train centers and length scales of a small map: the number of clusters is chosen
-    # by the held-out loss of a coarse map (`scene_clusters`), about a third of the default.
-    # Probabilities are as accurate, but ranges and meshes are less exact. 4 is recommended; 0: off.
+    # passes that train the shapes of a small map, about a third of the default: the number of clusters
+    # is chosen by the held-out loss of a coarse map (`scene_clusters`). Probabilities are as accurate,
+    # but ranges and meshes are less exact. 4 is recommended; 0: off.
     shape_passes: int = 0
+    # also train centers and length scales of other maps, after half of the passes (`shaping`)
+    adapt_shapes: bool = True
 
     def rows_per_batch(self, num_points: int) -> int:
         """Points per step: about ``batch_size``, with equally large batches in each pass."""
@@ -70,19 +72,16 @@ class FitConfig:
     def __post_init__(self) -> None:
         if self.passes is not None and self.passes < 1:
             raise ValueError(f"passes must be 1 or more, or None; got {self.passes}")
-        if self.shape_passes < 0:
-            raise ValueError(f"shape_passes must be 0 or more; got {self.shape_passes}")
         if self.batch_size is not None and self.batch_size < 1:
             raise ValueError(f"batch_size must be 1 or more; got {self.batch_size}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate must be > 0; got {self.learning_rate}")
         if not 0 < self.occupied_share < 1:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
-        if not self.unknown_share >= 0:
-            raise ValueError(f"unknown_share must be 0 or more; got {self.unknown_share}")
+        for name in ("unknown_share", "shape_passes", "l1", "l2"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be 0 or more; got {getattr(self, name)}")
         check_noise(self.hit_noise)
-        if self.l1 < 0 or self.l2 < 0:
-            raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
 
 class FitTask(NamedTuple):
@@ -130,21 +129,21 @@ def fit_clusters(
     points = blurred_hits(points, labels, task.config.hit_noise, task.rng)
     order = torch.arange(len(points), device=points.device)
     batch_size = task.config.rows_per_batch(len(points))
-    order, labels = stratified_batches((order, labels), batch_size, task.rng)
+    order, mixed, labels = stratified_batches((order, points, labels), batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def compute(rows: slice) -> tuple[Tensor, Tensor]:
         given = (state.centers, state.raw_scale_tril, task.kernel, index)
         if len(order[rows]) == len(points):
             return ordered_features(points, order, *given)
-        return native.nearest_features(points[order[rows]], *given)
+        return native.nearest_features(mixed[rows], *given)
 
     features_of = _LastFeatures(compute)
     weights = fit_weights(features_of, labels, state.weights, task.config, task.progress)
     state = replace(state, weights=weights)
     if refine is None:
         return state
-    return refine(state, Batched(points[order], labels, features_of), task)
+    return refine(state, Batched(mixed, labels, features_of), task)
 
 
 class _LastFeatures:
@@ -236,6 +235,13 @@ def balance_classes(
     return factors[(2 * labels).long()]
 
 
+def loss_factors(labels: Tensor, config: FitConfig) -> Tensor:
+    """(N,) labels -> (N,) loss factors with the class weights of the settings."""
+    if not config.balance:
+        return torch.ones_like(labels)
+    return balance_classes(labels, config.occupied_share, config.unknown_share)
+
+
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
     """Sum of the points' negative log-likelihoods, the data term of eq. (3).
 
@@ -274,11 +280,7 @@ def fit_weights(
 
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
-    if factors is None:
-        class_weights = (config.occupied_share, config.unknown_share)
-        factors = (
-            balance_classes(labels, *class_weights) if config.balance else torch.ones_like(labels)
-        )
+    factors = loss_factors(labels, config) if factors is None else factors
     batch_size = config.rows_per_batch(len(labels))
     passes = config.passes_over(len(labels))
     plan = _Plan(config, batch_size, len(labels), passes * -(-len(labels) // batch_size))
