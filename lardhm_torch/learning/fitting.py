@@ -46,7 +46,7 @@ class FitConfig:
     balance: bool = True  # weight the classes independently of their numbers of points
     # Class weight of occupied points, as a fraction of the loss, if classes are balanced. It exceeds
     # one half because hits are fewer than free points, so they generalize less well to unseen rays.
-    occupied_share: float = 0.55
+    occupied_share: float = 0.6
     unknown_share: float = 0.25  # weight of the loss of unknown points, relative to all others
     bridge_gaps: bool = True  # extend surfaces across gaps that no ray crossed (`bridging`)
     # [m] standard deviation of random displacements of hits while the weights are trained. Surfaces are
@@ -231,15 +231,13 @@ def balance_classes(
     labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
 ) -> Tensor:
     """(N,) labels -> (N,) loss factors, see `label_factors`."""
-    factors = label_factors(labels, occupied_share, unknown_share).to(labels)
-    return factors[(2 * labels).long()]
+    return label_factors(labels, occupied_share, unknown_share).to(labels)[(2 * labels).long()]
 
 
 def loss_factors(labels: Tensor, config: FitConfig) -> Tensor:
     """(N,) labels -> (N,) loss factors with the class weights of the settings."""
-    if not config.balance:
-        return torch.ones_like(labels)
-    return balance_classes(labels, config.occupied_share, config.unknown_share)
+    shares = (config.occupied_share, config.unknown_share)
+    return balance_classes(labels, *shares) if config.balance else torch.ones_like(labels)
 
 
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:

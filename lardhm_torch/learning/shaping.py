@@ -41,7 +41,7 @@ FRESH = 0.1  # the features of points that are drawn more often than this are co
 PASSES, BATCHES = 3, 8  # over the points that are drawn
 MIN_BATCH = 256  # points
 RATES = TuneConfig(center_rate=0.05, scale_rate=0.05)
-WEIGHT_RATE = 0.5  # learning rate of the passes that are left, relative to that of the first
+WEIGHT_RATE = 0.2  # learning rate of the passes that are left, relative to that of the first
 
 
 def first_passes(config: FitConfig, num_points: int) -> FitConfig:
