@@ -3,8 +3,15 @@
 import pytest
 import torch
 
-from lardhm_torch import FitConfig, LardHilbertMap, Scans, raycast, sample_rays, simulate_room
-from lardhm_torch import native
+from lardhm_torch import (
+    FitConfig,
+    LardHilbertMap,
+    Scans,
+    native,
+    raycast,
+    sample_rays,
+    simulate_room,
+)
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning import clearing
 from lardhm_torch.learning.fitting import FitTask
@@ -15,7 +22,7 @@ F64 = torch.float64
 
 @pytest.fixture(scope="module")
 def room():
-    return simulate_room(12_000)
+    return simulate_room(12_000, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +46,7 @@ def early(model, scans):
 
 
 def test_fewer_rays_end_early_at_the_frames_of_door_and_window(plain, clear):
-    others = simulate_room(12_000, seed=1)
+    others = simulate_room(24_000, seed=2)
     leaving = others.select((~others.is_return).nonzero().squeeze(1))
     before, after = early(plain, leaving), early(clear, leaving)
     assert before > 0.1
