@@ -14,7 +14,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.bridging import bridged
-from lardhm_torch.learning.clustering import group_classes
+from lardhm_torch.learning.clustering import ITERATIONS_OF, ROUGH_ITERATIONS, group_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.points import blurred_hits, check_noise
@@ -113,15 +113,15 @@ def fit_clusters(
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
         labels: (N,) 1 occupied, 0 free, 1/2 unknown, of the points' dtype.
-        num_clusters: total over all classes, or one number for each class; None: chosen from the
-            data.
+        num_clusters: total over all classes, or one number for each; None: chosen from the data.
         task: kernel, settings, random generator.
         refine: continues the training, with the samples in batches.
 
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
     floor = task.kernel.min_lengthscale
-    grouped = group_classes(points, labels, num_clusters, task.rng)
+    iterations = ITERATIONS_OF if refine is None else ROUGH_ITERATIONS
+    grouped = group_classes(points, labels, num_clusters, task.rng, iterations)
     state = even_kernels(new_rows(*grouped[:2], floor, fitted_evidence(grouped)), floor)
     if task.config.bridge_gaps:
         state, points, labels = bridged(state, points, labels, task.kernel, task.rng)
