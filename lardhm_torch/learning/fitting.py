@@ -120,7 +120,7 @@ def fit_clusters(
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
     floor = task.kernel.min_lengthscale
-    iterations = ITERATIONS_OF if refine is None else ROUGH_ITERATIONS
+    iterations = ROUGH_ITERATIONS if task.config.adapt_shapes else ITERATIONS_OF
     grouped = group_classes(points, labels, num_clusters, task.rng, iterations)
     state = even_kernels(new_rows(*grouped[:2], floor, fitted_evidence(grouped)), floor)
     if task.config.bridge_gaps:
