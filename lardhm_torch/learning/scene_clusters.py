@@ -61,7 +61,7 @@ def fit_scene(
     """Fit a map; None: as many clusters as the scene needs.
 
     A number that is given, few points, points of one class, and ``FitConfig(shape_passes=0)`` give
-    what `fit_clusters` does.
+    what `fit_clusters` does, followed by `shaped` and, with ``rays``, by `cleared`.
 
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
