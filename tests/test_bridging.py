@@ -150,3 +150,14 @@ def test_no_point_near_a_place_is_left_out_before_the_search():
     assert near.any()
     assert len(found) < 5000
     assert bool((found[:, None] == points[near]).all(dim=2).any(dim=0).all())
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_close_points_are_those_of_plain_torch(ops, monkeypatch, dim, dtype):
+    rng = torch.Generator().manual_seed(5)
+    points = (20 * torch.rand(5000, dim, generator=rng) - 10).to(dtype)
+    fast = close_points(points, points[:40] + 0.1, 0.3)
+    monkeypatch.setattr("lardhm_torch.native.supports", lambda *_: False)
+    assert torch.equal(fast, close_points(points, points[:40] + 0.1, 0.3))
+    assert 0 < len(fast) < len(points)

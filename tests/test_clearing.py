@@ -3,13 +3,22 @@
 import pytest
 import torch
 
-from lardhm_torch import FitConfig, LardHilbertMap, Scans, raycast, sample_rays, simulate_room
+from lardhm_torch import (
+    FitConfig,
+    LardHilbertMap,
+    Scans,
+    native,
+    raycast,
+    sample_rays,
+    simulate_room,
+)
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning import clearing
 from lardhm_torch.learning.fitting import FitTask
 from lardhm_torch.learning.parameters import read_state
 
 F64 = torch.float64
+ALONE = FitConfig(adapt_shapes=False)
 
 
 @pytest.fixture(scope="module")
@@ -24,12 +33,14 @@ def samples(room):
 
 @pytest.fixture(scope="module")
 def plain(samples):
-    return LardHilbertMap().fit(samples.points, samples.labels).requires_grad_(False)
+    model = LardHilbertMap().fit(samples.points, samples.labels, config=ALONE)
+    return model.requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
 def clear(samples, room):
-    return LardHilbertMap().fit(samples.points, samples.labels, rays=room).requires_grad_(False)
+    model = LardHilbertMap().fit(samples.points, samples.labels, rays=room, config=ALONE)
+    return model.requires_grad_(False)
 
 
 def early(model, scans):
@@ -67,9 +78,10 @@ def test_ends_are_those_of_plain_torch(plain, room, monkeypatch):
     few = room.select(torch.arange(0, len(room), 400))
     rays = clearing.ray_lines(few, plain.origin, task)
     rays = rays._replace(starts=rays.starts.expand_as(rays.ahead))
-    native_depths = clearing.end_depths(read_state(plain), rays, plain.kernel)
+    given = (rays, plain.kernel, native.build_index(plain.centers, plain.kernel.num_neighbors))
+    native_depths = clearing.end_depths(read_state(plain), *given)
     monkeypatch.setattr(clearing.native, "supports", lambda *_: False)
-    plain_depths = clearing.end_depths(read_state(plain), rays, plain.kernel)
+    plain_depths = clearing.end_depths(read_state(plain), *given)
     assert bool(plain_depths.isfinite().any())
     assert (native_depths - plain_depths).abs().nan_to_num(0).max() < 1e-6
 

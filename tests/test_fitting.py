@@ -173,7 +173,7 @@ def test_stratified_batches_hold_every_sample_once_and_each_batch_covers_all_of_
         ({"passes": 0}, "passes must be 1 or more, or None; got 0"),
         ({"batch_size": 0}, "batch_size must be 1 or more; got 0"),
         ({"learning_rate": 0.0}, "learning_rate must be > 0; got 0"),
-        ({"l1": -1.0}, "l1 and l2 must be 0 or more; got -1"),
+        ({"l1": -1.0}, "l1 must be 0 or more; got -1"),
     ],
 )
 def test_settings_are_checked_when_made(settings, message):

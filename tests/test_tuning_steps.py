@@ -14,6 +14,7 @@ from lardhm_torch.learning.tuning_steps import (
     from_rows,
     plain_steps,
     to_rows,
+    tuned_features,
     tuning_steps,
 )
 
@@ -49,6 +50,25 @@ def test_the_native_steps_are_those_of_plain_torch(ops, dim, num_neighbors):
     torch.testing.assert_close(
         tuning_steps(*task, 7, PLAN), plain_steps(*task, 7, PLAN), rtol=1e-10, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(("dim", "num_neighbors"), [(2, 1), (3, 5), (2, 16), (3, 21), (3, 30)])
+def test_features_after_tuning_are_those_of_plain_torch(ops, monkeypatch, dim, num_neighbors):
+    batches, near, table, moving = problem(dim, num_neighbors)
+    given = (batches.points, near, table, moving.offsets)
+    fast = tuned_features(*given)
+    monkeypatch.setattr(native, "supports", lambda *_: False)
+    torch.testing.assert_close(fast, tuned_features(*given), rtol=1e-10, atol=1e-12)
+    assert float(fast.max()) > 0.5
+
+
+def test_features_before_tuning_are_those_of_the_map(ops):
+    batches, _, table, moving = problem(3, 16)
+    _, centers, raw = (part.contiguous() for part in from_rows(table.start))
+    index = native.build_index(centers, 16)
+    near, values = native.nearest_features(batches.points, centers, raw, table.kernel, index)
+    found = tuned_features(batches.points, near, table, 0 * moving.offsets)
+    torch.testing.assert_close(found, values)
 
 
 def test_native_steps_in_float32_are_close(ops):

@@ -194,6 +194,8 @@ def close_points(points: Tensor, places: Tensor, radius: float) -> Tensor:
 
     A hash of cells finds them in much less time than a search.
     """
+    if native.supports(points):
+        return points_where(points, torch.ops.lardhm.in_cells_around(points, places, radius))
     edge, dim = 2 * radius, points.shape[1]
     corners = torch.cartesian_prod(*[places.new_tensor([-radius, radius])] * dim).view(-1, dim)
     marked = torch.zeros(1 << CELL_BITS, dtype=torch.bool, device=points.device)

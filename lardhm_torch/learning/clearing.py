@@ -22,8 +22,8 @@ from lardhm_torch.learning.fitting import (
     CHUNK_ROWS,
     Batched,
     FitTask,
-    balance_classes,
     fit_weights,
+    loss_factors,
 )
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.passing import lines_of
@@ -73,21 +73,24 @@ def cleared(state: MapState, samples: Batched, task: FitTask, rays: Lines) -> Ma
         task: kernel, settings, random generator.
         rays: in the map's frame; space is free before their ``reach``.
     """
-    found = pierced(state, rays, task)
-    changed = stopping(state, found.ends, task.kernel)
+    index = native.build_index(state.centers, task.kernel.num_neighbors)
+    found = pierced(state, rays, task, index)
+    changed = stopping(state, found.ends, task.kernel, index)
     if len(changed) == 0:
         return state
     config = task.config
     size = config.rows_per_batch(len(samples.points))
     rows = slice(0, min(len(samples.points), size * max(1, CHUNK_ROWS // size)))
     points, labels = samples.points[rows], samples.labels[rows]
-    factors = balance_classes(labels, config.occupied_share, config.unknown_share)
+    factors = loss_factors(labels, config)
     indices, values = samples.features_of(rows)
     moves = torch.zeros_like(state.is_occupied).index_fill_(0, changed, True)
     close = moves.index_select(0, indices.reshape(-1)).view_as(values) & (values > FEATURE)
     close = close.any(dim=1).nonzero().squeeze(1)
+    around = native.nearest_centers(found.places, state.centers, indices.shape[1], index)
     batches = Batches(points[close], labels[close], factors[close])
-    state = _reshaped(state, moves, batches, indices[close], found.places, task)
+    near = torch.cat([indices[close], around.to(indices)])
+    state = _reshaped(state, moves, batches, near, found.places, task)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
     shapes = (state.centers, state.raw_scale_tril, task.kernel, index)
     new_indices, new_values = native.nearest_features(batches.points, *shapes)
@@ -100,12 +103,12 @@ def cleared(state: MapState, samples: Batched, task: FitTask, rays: Lines) -> Ma
     return replace(state, weights=weights)
 
 
-def pierced(state: MapState, rays: Lines, task: FitTask) -> Pierced:
+def pierced(state: MapState, rays: Lines, task: FitTask, index: Tensor) -> Pierced:
     """Where the map ends some of the rays early, see `cleared`."""
     every = torch.arange(len(rays.reach), device=rays.reach.device)
     asked = at_most(every, MAX_RAYS, task.rng)
     rays = Lines(rays.starts_of(asked).expand(len(asked), -1), rays.ahead[asked], rays.reach[asked])
-    depths = end_depths(state, rays, task.kernel)
+    depths = end_depths(state, rays, task.kernel, index)
     rows = (depths < rays.reach - EARLY).nonzero().squeeze(1)
     starts, ahead, depths = rays.starts[rows], rays.ahead[rows], depths[rows, None]
     count = round(AROUND / SPACING)
@@ -116,11 +119,10 @@ def pierced(state: MapState, rays: Lines, task: FitTask) -> Pierced:
     return Pierced((starts + depths * ahead).to(like), places[inside].to(like))
 
 
-def end_depths(state: MapState, rays: Lines, kernel: Kernel) -> Tensor:
+def end_depths(state: MapState, rays: Lines, kernel: Kernel, index: Tensor) -> Tensor:
     """(R,) depths of the first steps where the log-odds exceed `OCCUPIED` [m]; infinite if none."""
     if len(rays.reach) == 0:
         return rays.reach
-    index = native.build_index(state.centers, kernel.num_neighbors)
     parameters = (state.centers, state.raw_scale_tril, state.weights)
     farthest = float(rays.reach.max())
     if native.supports(state.centers):
@@ -140,9 +142,8 @@ def end_depths(state: MapState, rays: Lines, kernel: Kernel) -> Tensor:
     return torch.cat(ends)
 
 
-def stopping(state: MapState, ends: Tensor, kernel: Kernel) -> Tensor:
+def stopping(state: MapState, ends: Tensor, kernel: Kernel, index: Tensor) -> Tensor:
     """Rows of the occupied clusters that stop rays at (R, D) ends, and of those close to them."""
-    index = native.build_index(state.centers, kernel.num_neighbors)
     shapes = (state.centers, state.raw_scale_tril, kernel, index)
     indices, values = native.nearest_features(ends, *shapes)
     indices = indices.long()
@@ -162,19 +163,17 @@ def _reshaped(
         state: M clusters.
         moves: (M,) bool.
         batches: samples close to these clusters.
-        near: (N, K) the clusters nearest to them.
+        near: (N + P, K) the clusters nearest to them and to the places.
         places: (P, D) on rays that were stopped [m].
         task: kernel, random generator.
     """
-    index = native.build_index(state.centers, task.kernel.num_neighbors)
-    around = native.nearest_centers(places, state.centers, near.shape[1], index).to(near)
     free = batches.factors[batches.labels == 0]
     factor = float(free[0]) if len(free) else 1.0
     columns = (
         torch.cat([batches.points, places]),
         torch.cat([batches.labels, batches.labels.new_zeros(len(places))]),
         torch.cat([batches.factors, batches.factors.new_full((len(places),), factor)]),
-        torch.cat([near, around]),
+        near,
     )
     count, rng = len(columns[0]), task.rng
     order = torch.randperm(count, generator=rng, device=rng.device)

@@ -24,8 +24,9 @@ DENSE_POINTS = 35  # maximum, for dense points: smaller clusters would fit the n
 CELL_EDGE, CELLS_PER_CLUSTER = 0.2, 4  # [m] grid cells, and occupied cells per cluster
 CELLS_PER_SCAN_CLUSTER = 1  # the same in `scan_clusters`
 MAX_CHOSEN = 5000  # upper bound per class in `choose_num_clusters`
-FIT_ITERATIONS = 15  # of k-means, of occupied points
-VOLUME_ITERATIONS = 5  # the same of free and unknown points, if there are unknown points
+# iterations of k-means, of occupied points, and of free and unknown points if there are unknown ones
+ITERATIONS_OF = (15, 5)
+ROUGH_ITERATIONS = (8, 3)  # the same if centers and length scales are trained afterwards
 FEW_POINTS = 64  # classes up to this size may have one cluster per point
 MIN_COUNT = 5  # smaller clusters are merged into their nearest neighbor (paper, Section IV-B)
 
@@ -144,6 +145,7 @@ def group_classes(
     labels: Tensor,
     num_clusters: int | Sequence[int] | None,
     rng: torch.Generator,
+    iterations: tuple[int, int] = ITERATIONS_OF,
 ) -> Grouped:
     """The clusters of `cluster_classes`, and which points belong to each."""
     classes = split_labels(points, labels)
@@ -154,7 +156,7 @@ def group_classes(
         totals = list(num_clusters)
     else:
         totals = split_clusters([len(members) for members in classes], num_clusters)
-    return cluster_each(classes, totals, rng)
+    return cluster_each(classes, totals, rng, iterations)
 
 
 def class_ratios(num_unknown: int) -> tuple[int, int, int]:
@@ -166,7 +168,12 @@ def class_ratios(num_unknown: int) -> tuple[int, int, int]:
     return (1, 2, 1) if num_unknown else (1, 1, 0)
 
 
-def cluster_each(classes: list[Tensor], totals: Sequence[int], rng: torch.Generator) -> Grouped:
+def cluster_each(
+    classes: list[Tensor],
+    totals: Sequence[int],
+    rng: torch.Generator,
+    iterations: tuple[int, int] = ITERATIONS_OF,
+) -> Grouped:
     """Cluster each class.
 
     Args:
@@ -174,16 +181,16 @@ def cluster_each(classes: list[Tensor], totals: Sequence[int], rng: torch.Genera
             order of `morton_order`.
         totals: number of clusters to find in each class.
         rng: random generator.
+        iterations: of k-means, see `ITERATIONS_OF`.
     """
     with_unknown = len(classes) > 2 and len(classes[2]) > 0
-    rest = VOLUME_ITERATIONS if with_unknown else FIT_ITERATIONS
     parts, owners, numbers = [], [], []
     for kind, (members, total) in enumerate(zip(classes, totals, strict=True)):
         numbers.append(0)
         owners.append(torch.full_like(members[:, 0], -1, dtype=torch.int32))
         if len(members) and total:
-            iterations = rest if kind else FIT_ITERATIONS
-            found, owners[kind] = grouped_points(members, total, rng, iterations)
+            turns = iterations[1 if kind and with_unknown else 0]
+            found, owners[kind] = grouped_points(members, total, rng, turns)
             numbers[kind] = len(found)
             parts.append(unknown_clusters(found) if kind == 2 else found)
     clusters = concatenate_clusters(parts)

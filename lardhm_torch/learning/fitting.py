@@ -14,7 +14,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.bridging import bridged
-from lardhm_torch.learning.clustering import group_classes
+from lardhm_torch.learning.clustering import ITERATIONS_OF, ROUGH_ITERATIONS, group_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
 from lardhm_torch.learning.points import blurred_hits, check_noise
@@ -31,9 +31,9 @@ FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 class FitConfig:
     """Training settings of the weights.
 
-    The defaults train to convergence. The settings of the paper, one pass at a constant learning rate
-    without preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False,
-    preconditioner=False, batch_size=1)``; the log-loss is then higher (see docs and benchmarks).
+    The settings of the paper, one pass over the weights at a constant learning rate without
+    preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False, preconditioner=False,
+    batch_size=1, adapt_shapes=False)``; the log-loss is then higher (see docs and benchmarks).
     """
 
     passes: int | None = None  # passes over all points; None: 4, or more to reach `MIN_STEPS` steps
@@ -52,10 +52,12 @@ class FitConfig:
     # [m] standard deviation of random displacements of hits while the weights are trained. Surfaces are
     # then as thick as scans disagree (`scan_disagreement`), for queries at the poses of other scans.
     hit_noise: float = 0.0
-    # passes that also train centers and length scales of a small map: the number of clusters is chosen
-    # by the held-out loss of a coarse map (`scene_clusters`), about a third of the default.
-    # Probabilities are as accurate, but ranges and meshes are less exact. 4 is recommended; 0: off.
+    # passes that train the shapes of a small map, about a third of the default: the number of clusters
+    # is chosen by the held-out loss of a coarse map (`scene_clusters`). Probabilities are as accurate,
+    # but ranges and meshes are less exact. 4 is recommended; 0: off.
     shape_passes: int = 0
+    # also train centers and length scales of other maps, after half of the passes (`shaping`)
+    adapt_shapes: bool = True
 
     def rows_per_batch(self, num_points: int) -> int:
         """Points per step: about ``batch_size``, with equally large batches in each pass."""
@@ -70,19 +72,16 @@ class FitConfig:
     def __post_init__(self) -> None:
         if self.passes is not None and self.passes < 1:
             raise ValueError(f"passes must be 1 or more, or None; got {self.passes}")
-        if self.shape_passes < 0:
-            raise ValueError(f"shape_passes must be 0 or more; got {self.shape_passes}")
         if self.batch_size is not None and self.batch_size < 1:
             raise ValueError(f"batch_size must be 1 or more; got {self.batch_size}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate must be > 0; got {self.learning_rate}")
         if not 0 < self.occupied_share < 1:
             raise ValueError(f"occupied_share must be in (0, 1); got {self.occupied_share}")
-        if not self.unknown_share >= 0:
-            raise ValueError(f"unknown_share must be 0 or more; got {self.unknown_share}")
+        for name in ("unknown_share", "shape_passes", "l1", "l2"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be 0 or more; got {getattr(self, name)}")
         check_noise(self.hit_noise)
-        if self.l1 < 0 or self.l2 < 0:
-            raise ValueError(f"l1 and l2 must be 0 or more; got {self.l1} and {self.l2}")
 
 
 class FitTask(NamedTuple):
@@ -114,15 +113,15 @@ def fit_clusters(
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
         labels: (N,) 1 occupied, 0 free, 1/2 unknown, of the points' dtype.
-        num_clusters: total over all classes, or one number for each class; None: chosen from the
-            data.
+        num_clusters: total over all classes, or one number for each; None: chosen from the data.
         task: kernel, settings, random generator.
         refine: continues the training, with the samples in batches.
 
     Source: Guizilini & Ramos 2016, Sections II and III.
     """
     floor = task.kernel.min_lengthscale
-    grouped = group_classes(points, labels, num_clusters, task.rng)
+    iterations = ROUGH_ITERATIONS if task.config.adapt_shapes else ITERATIONS_OF
+    grouped = group_classes(points, labels, num_clusters, task.rng, iterations)
     state = even_kernels(new_rows(*grouped[:2], floor, fitted_evidence(grouped)), floor)
     if task.config.bridge_gaps:
         state, points, labels = bridged(state, points, labels, task.kernel, task.rng)
@@ -130,21 +129,21 @@ def fit_clusters(
     points = blurred_hits(points, labels, task.config.hit_noise, task.rng)
     order = torch.arange(len(points), device=points.device)
     batch_size = task.config.rows_per_batch(len(points))
-    order, labels = stratified_batches((order, labels), batch_size, task.rng)
+    order, mixed, labels = stratified_batches((order, points, labels), batch_size, task.rng)
     index = native.build_index(state.centers, task.kernel.num_neighbors)
 
     def compute(rows: slice) -> tuple[Tensor, Tensor]:
         given = (state.centers, state.raw_scale_tril, task.kernel, index)
         if len(order[rows]) == len(points):
             return ordered_features(points, order, *given)
-        return native.nearest_features(points[order[rows]], *given)
+        return native.nearest_features(mixed[rows], *given)
 
     features_of = _LastFeatures(compute)
     weights = fit_weights(features_of, labels, state.weights, task.config, task.progress)
     state = replace(state, weights=weights)
     if refine is None:
         return state
-    return refine(state, Batched(points[order], labels, features_of), task)
+    return refine(state, Batched(mixed, labels, features_of), task)
 
 
 class _LastFeatures:
@@ -232,8 +231,13 @@ def balance_classes(
     labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
 ) -> Tensor:
     """(N,) labels -> (N,) loss factors, see `label_factors`."""
-    factors = label_factors(labels, occupied_share, unknown_share).to(labels)
-    return factors[(2 * labels).long()]
+    return label_factors(labels, occupied_share, unknown_share).to(labels)[(2 * labels).long()]
+
+
+def loss_factors(labels: Tensor, config: FitConfig) -> Tensor:
+    """(N,) labels -> (N,) loss factors with the class weights of the settings."""
+    shares = (config.occupied_share, config.unknown_share)
+    return balance_classes(labels, *shares) if config.balance else torch.ones_like(labels)
 
 
 def logistic_loss(log_odds: Tensor, labels: Tensor, factors: Tensor) -> Tensor:
@@ -274,11 +278,7 @@ def fit_weights(
 
     Source: Guizilini & Ramos 2016, eq. (2) to (4).
     """
-    if factors is None:
-        class_weights = (config.occupied_share, config.unknown_share)
-        factors = (
-            balance_classes(labels, *class_weights) if config.balance else torch.ones_like(labels)
-        )
+    factors = loss_factors(labels, config) if factors is None else factors
     batch_size = config.rows_per_batch(len(labels))
     passes = config.passes_over(len(labels))
     plan = _Plan(config, batch_size, len(labels), passes * -(-len(labels) // batch_size))

@@ -30,6 +30,7 @@ from lardhm_torch.learning.fitting import (
     logistic_loss,
 )
 from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.shaping import first_passes, shaped
 from lardhm_torch.learning.tuning_steps import (
     Batches,
     Moving,
@@ -60,7 +61,7 @@ def fit_scene(
     """Fit a map; None: as many clusters as the scene needs.
 
     A number that is given, few points, points of one class, and ``FitConfig(shape_passes=0)`` give
-    what `fit_clusters` does.
+    what `fit_clusters` does, followed by `shaped` and, with ``rays``, by `cleared`.
 
     Args:
         points: (N, D) positions in the map's frame [m], in Morton order.
@@ -69,10 +70,19 @@ def fit_scene(
         task: kernel, settings, random generator.
         rays: of the points, in the map's frame, that the map should not end early; None: any.
     """
-    if num_clusters is not None or not is_learnable(labels, task):
+    if num_clusters is None and is_learnable(labels, task):
+        return fit_shapes(points, labels, needed_clusters(points, labels, task), task)
+    if not task.config.adapt_shapes:
         refine = None if rays is None else partial(cleared, rays=rays)
         return fit_clusters(points, labels, num_clusters, task, refine)
-    return fit_shapes(points, labels, needed_clusters(points, labels, task), task)
+    first = first_passes(task.config, len(points))
+    left = task.config.passes_over(len(points)) - first.passes_over(len(points))
+
+    def refined(state: MapState, samples: Batched, task: FitTask) -> MapState:
+        state, samples = shaped(state, samples, task, left)
+        return state if rays is None else cleared(state, samples, task, rays)
+
+    return fit_clusters(points, labels, num_clusters, task._replace(config=first), refined)
 
 
 def is_learnable(labels: Tensor, task: FitTask) -> bool:

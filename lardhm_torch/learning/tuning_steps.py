@@ -113,6 +113,24 @@ def tuning_steps(
     return Moving(*result)
 
 
+def tuned_features(points: Tensor, indices: Tensor, table: Table, offsets: Tensor) -> Tensor:
+    """(N, K) kernel values of the neighbors that were used for tuning, times the fade.
+
+    Args:
+        points: (N, D) positions [m].
+        indices: (N, K) clusters near each.
+        table: parameters before tuning.
+        offsets: (M, G) of the parameters.
+    """
+    if native.supports(points) and indices.shape[1] > 0:
+        given = (points, indices, table.start, table.unit, offsets)
+        return torch.ops.lardhm.tuned_features(*given, *table.kernel[1:])
+    _, centers, raw = table.parameters(offsets)
+    near = indices.long()
+    values = lard_kernel(points, centers, kernel_factors(raw, table.kernel), near)
+    return values * neighbor_fade(points, centers, near)
+
+
 def plain_steps(
     batches: Batches, indices: Tensor, table: Table, moving: Moving, step: int, plan: Plan
 ) -> Moving:

@@ -328,6 +328,7 @@ def _register() -> None:
     def _(points: Tensor) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.long)
 
+    @library.register_fake("lardhm::in_cells_around")
     @library.register_fake("lardhm::unmarked_cells")
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.bool)
@@ -363,10 +364,18 @@ def _register() -> None:
     def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor, stride: int) -> Tensor:
         return labels.new_empty(-(-labels.shape[0] // stride))
 
+    @library.register_fake("lardhm::misfits")
+    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
+        return torch.empty_like(labels)
+
     @library.register_fake("lardhm::tuning_steps")
     def _(points: Tensor, indices: Tensor, labels: Tensor, factors: Tensor, start: Tensor,
           *_: Any) -> tuple[Tensor, ...]:  # fmt: skip
         return tuple(torch.empty_like(start) for _ in range(3))
+
+    @library.register_fake("lardhm::tuned_features")
+    def _(points: Tensor, indices: Tensor, *_: Any) -> Tensor:
+        return points.new_empty(indices.shape)
 
     @library.register_fake("lardhm::nearest_clusters")
     def _(points: Tensor, *_: Any) -> Tensor:

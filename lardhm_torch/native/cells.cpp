@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <vector>
@@ -162,10 +163,50 @@ Tensor unmarked_cells(const Tensor& given_points, const Tensor& given_cells,
   return unmarked;
 }
 
+constexpr int kMarkedBits = 20;  // as bridging.CELL_BITS
+
+// Entry of the cell of a place in a table of 2^kMarkedBits.
+template <class T, int D>
+uint32_t marked_entry(const T* place, T edge) {
+  uint32_t entry = 0;
+  for (int d = 0; d < D; ++d) entry ^= uint32_t(int64_t(std::floor(place[d] / edge))) * kPrimes[d];
+  return entry;  // of which only the low bits matter
+}
+
+// Whether the cell of a point, two radii wide, is one of those around some place.
+Tensor in_cells_around(const Tensor& given_points, const Tensor& given_places, double radius) {
+  const Tensor points = tidy(given_points), places = tidy(given_places);
+  check_rows("points", points, places);
+  const int64_t n = points.size(0);
+  const Tensor found = new_empty(points, {n}, ScalarType::Bool);
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const T edge = T(2 * radius);
+    Bits marked(kMarkedBits);
+    for (int64_t row = 0; row < places.size(0); ++row)
+      for (int corner = 0; corner < 1 << D; ++corner) {
+        T at[D];
+        for (int d = 0; d < D; ++d)
+          at[d] = in<T>(places)[row * D + d] + (corner >> d & 1 ? T(radius) : -T(radius));
+        marked.mark(marked_entry<T, D>(at, edge));
+      }
+    run_tasks((n + kPointsPerTask - 1) / kPointsPerTask, [&](int64_t task) {
+      const int64_t stop = std::min(n, (task + 1) * kPointsPerTask);
+      for (int64_t row = task * kPointsPerTask; row < stop; ++row)
+        out<bool>(found)[row] = marked.has(marked_entry<T, D>(in<T>(points) + row * D, edge));
+    });
+    return 0;
+  });
+  return found;
+}
+
 }  // namespace
 
 std::vector<Operator> cells_operators() {
   return {
+      {"in_cells_around(Tensor points, Tensor places, float radius) -> Tensor",
+       &boxed<in_cells_around>},
       {"unmarked_cells(Tensor points, Tensor cells, Tensor inside, Tensor ways, Tensor steps) -> "
        "Tensor",
        &boxed<unmarked_cells>},

@@ -49,28 +49,37 @@ __attribute__((always_inline)) inline void for_indices(const int32_t* index, int
   if (k % 2) use(k - 1, uint32_t(index[k - 1]));
 }
 
-// Gradient of the loss of the rows begin .. end with respect to the weights, added to `slope`: the
-// residuals of some rows, then their gradients, so that no row waits for its own sigmoid.
+constexpr int kTogether = 64;
+
+// Probabilities of some rows together, so that no row waits for its own sigmoid.
+template <class T, int K>
+inline void predict(const Rows<T>& rows, int64_t first, int count, const T* __restrict weights,
+                    T* __restrict at) {
+  constexpr int W = Simd<T>::W;
+  using V = typename Simd<T>::V;
+  const int64_t k = K > 0 ? K : rows.k;
+  for (int i = 0; i < count; ++i) {
+    const T* value = rows.values + (first + i) * k;
+    T sum = 0;
+    for_indices<K>(rows.indices + (first + i) * k, k,
+                   [&](int64_t j, uint32_t index) { sum += value[j] * weights[index]; });
+    at[i] = sum;
+  }
+  for (int i = 0; i < kTogether; i += W) {
+    const V probability = sigmoid<T>(load<V>(at + i));
+    std::memcpy(at + i, &probability, sizeof(probability));
+  }
+}
+
+// Gradient of the loss of the rows begin .. end with respect to the weights, added to `slope`.
 template <class T, int K>
 void add_gradient(const Rows<T>& rows, int64_t begin, int64_t end, const T* __restrict weights,
                   T* __restrict slope) {
-  constexpr int kTogether = 64, W = Simd<T>::W;
-  using V = typename Simd<T>::V;
   const int64_t k = K > 0 ? K : rows.k;
-  alignas(64) T at[kTogether] = {};  // log-odds, then probabilities
+  alignas(64) T at[kTogether] = {};
   for (int64_t first = begin; first < end; first += kTogether) {
     const int count = int(std::min<int64_t>(kTogether, end - first));
-    for (int i = 0; i < count; ++i) {
-      const T* value = rows.values + (first + i) * k;
-      T sum = 0;
-      for_indices<K>(rows.indices + (first + i) * k, k,
-                     [&](int64_t j, uint32_t index) { sum += value[j] * weights[index]; });
-      at[i] = sum;
-    }
-    for (int i = 0; i < kTogether; i += W) {
-      const V probability = sigmoid<T>(load<V>(at + i));
-      std::memcpy(at + i, &probability, sizeof(probability));
-    }
+    predict<T, K>(rows, first, count, weights, at);
     for (int i = 0; i < count; ++i) {
       const int64_t row = first + i;
       const T* value = rows.values + row * k;
@@ -206,10 +215,39 @@ Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
   return losses;
 }
 
+// How far the probability of each row is from its label.
+Tensor misfits(const Tensor& given_indices, const Tensor& given_values, const Tensor& given_labels,
+               const Tensor& given_weights) {
+  const Tensor indices = tidy(given_indices), values = tidy(given_values);
+  const Tensor labels = tidy(given_labels), weights = tidy(given_weights);
+  check_descent(indices, values, labels, labels, {weights, weights, weights});
+  const int64_t n = values.size(0);
+  const Tensor found = new_empty(values, {n});
+  const auto run = [&](auto type) {
+    using T = decltype(type);
+    constexpr int64_t kGrain = 64 * kTogether;
+    const Rows<T> rows{in<int32_t>(indices), in<T>(values), in<T>(labels), nullptr, values.size(1)};
+    run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
+      alignas(64) T at[kTogether] = {};
+      const int64_t end = std::min(n, (task + 1) * kGrain);
+      for (int64_t first = task * kGrain; first < end; first += kTogether) {
+        const int count = int(std::min<int64_t>(kTogether, end - first));
+        predict<T, 0>(rows, first, count, in<T>(weights), at);
+        for (int i = 0; i < count; ++i)
+          out<T>(found)[first + i] = std::abs(at[i] - rows.labels[first + i]);
+      }
+    });
+  };
+  values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});
+  return found;
+}
+
 }  // namespace
 
 std::vector<Operator> descent_operators() {
   return {
+      {"misfits(Tensor indices, Tensor values, Tensor labels, Tensor weights) -> Tensor",
+       &boxed<misfits>},
       {"excess_losses(Tensor indices, Tensor values, Tensor labels, Tensor weights, int stride) -> "
        "Tensor",
        &boxed<excess_losses>},

@@ -139,6 +139,14 @@ struct Lanes {
     return sum_lanes<T>(sum);
   }
 
+  void write_values(T fading, bool fades, T* to) const {
+    for (int64_t r = 0; r < rows; ++r) {
+      const V fade = fades ? fade_of<T>(squared[r] * fading) : V{} + T(1);
+      const V value = kernel[r] * fade;
+      std::memcpy(to + r * W, &value, std::min<int64_t>(W, k - r * W) * sizeof(T));
+    }
+  }
+
   // Gradients of weight, center and factor; `pull` is that of the log-odds.
   void backward(const T* x, T pull, T farthest, T fading, bool fades) {
     V reach = {}, tied = {};

@@ -176,16 +176,12 @@ void check_state(const Tensor& points, const Tensor& start, std::initializer_lis
           "unit, offsets, mean and square must be like start");
 }
 
-void check_samples(const Tensor& points, const Tensor& indices, const Tensor& labels,
-                   const Tensor& factors, int64_t count) {
-  const int64_t n = points.size(0);
-  check(indices.dim() == 2 && indices.size(0) == n && indices.scalar_type() == ScalarType::Int &&
-            indices.size(1) >= 1,
+void check_neighbors(const Tensor& points, const Tensor& indices, int64_t count) {
+  check(points.dim() == 2 && (points.size(1) == 2 || points.size(1) == 3),
+        "points must be (N, 2) or (N, 3)");
+  check(indices.dim() == 2 && indices.size(0) == points.size(0) &&
+            indices.scalar_type() == ScalarType::Int && indices.size(1) >= 1,
         "indices must be (N, K) int32, K at least 1");
-  check(labels.numel() == n && factors.numel() == n &&
-            labels.scalar_type() == points.scalar_type() &&
-            factors.scalar_type() == points.scalar_type(),
-        "labels and factors must be (N,), of the dtype of the points");
   const int32_t* index = in<int32_t>(indices);
   const int64_t entries = indices.numel();
   uint32_t largest = 0;
@@ -205,10 +201,12 @@ State tuning_steps(const Tensor& given_points, const Tensor& given_indices,
   const Tensor start = tidy(given_start), unit = tidy(given_unit);
   const Tensor rates = tidy(given_rates), penalties = tidy(given_penalties);
   check(batch_size >= 1 && warm_up >= 1, "batch_size and warm_up must be 1 or more");
-  check(points.dim() == 2 && (points.size(1) == 2 || points.size(1) == 3),
-        "points must be (N, 2) or (N, 3)");
+  check_neighbors(points, indices, start.size(0));
   check_state(points, start, {&unit, &offsets, &mean, &square});
-  check_samples(points, indices, labels, factors, start.size(0));
+  check(labels.numel() == points.size(0) && factors.numel() == points.size(0) &&
+            labels.scalar_type() == points.scalar_type() &&
+            factors.scalar_type() == points.scalar_type(),
+        "labels and factors must be (N,), of the dtype of the points");
   check(rates.scalar_type() == ScalarType::Double && penalties.scalar_type() == ScalarType::Double &&
             rates.numel() == start.size(1) && penalties.numel() == start.size(1),
         "rates and penalties must be float64, one for each column");
@@ -227,6 +225,41 @@ State tuning_steps(const Tensor& given_points, const Tensor& given_indices,
   return state;
 }
 
+// Kernel values of each point's neighbors, with the parameters of the table and the current offsets.
+Tensor tuned_features(const Tensor& given_points, const Tensor& given_indices,
+                      const Tensor& given_start, const Tensor& given_unit,
+                      const Tensor& given_offsets, double covariance_scale,
+                      double min_lengthscale) {
+  const Tensor points = tidy(given_points), indices = tidy(given_indices);
+  const Tensor start = tidy(given_start), unit = tidy(given_unit), offsets = tidy(given_offsets);
+  check_neighbors(points, indices, start.size(0));
+  check_state(points, start, {&unit, &offsets});
+  const int64_t n = points.size(0), k = indices.size(1), count = start.size(0);
+  const Scaling scaling{covariance_scale, min_lengthscale};
+  const Tensor values = new_empty(points, {n, k});
+  dispatch(points, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int64_t D = dim(), kGrain = 4096, kStride = Record<D>::stride;
+    const Table<T> table{in<T>(start), in<T>(unit), const_cast<T*>(in<T>(offsets)),
+                         nullptr,      nullptr,     count};
+    AlignedArray<T> records;
+    records.allocate(count * kStride);
+    for (int64_t m = 0; m < count; ++m)
+      write_record<T, D>(table, scaling, m, records.data + m * kStride);
+    run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
+      Lanes<T, D> lanes(k);
+      for (int64_t row = task * kGrain; row < std::min(n, (task + 1) * kGrain); ++row) {
+        lanes.read(in<int32_t>(indices) + row * k, records.data);
+        const T farthest = lanes.forward(in<T>(points) + row * D);
+        const T fading = T(1) / (farthest + std::numeric_limits<T>::min());
+        lanes.write_values(fading, k > 1 && k < count, out<T>(values) + row * k);
+      }
+    });
+    return 0;
+  });
+  return values;
+}
+
 }  // namespace tuning
 
 std::vector<Operator> tuning_operators() {
@@ -236,6 +269,9 @@ std::vector<Operator> tuning_operators() {
        "int num_points, int batch_size, int first_step, int total_steps, int warm_up, "
        "float covariance_scale, float min_lengthscale) -> (Tensor, Tensor, Tensor)",
        &boxed<tuning::tuning_steps>},
+      {"tuned_features(Tensor points, Tensor indices, Tensor start, Tensor unit, Tensor offsets, "
+       "float covariance_scale, float min_lengthscale) -> Tensor",
+       &boxed<tuning::tuned_features>},
   };
 }
 
