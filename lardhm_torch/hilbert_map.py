@@ -25,6 +25,7 @@ from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clearing import ray_lines
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask
+from lardhm_torch.learning.passing import lines_of
 from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.scene_clusters import fit_scene
 from lardhm_torch.learning.sized_maps import SMALL, fit_size
@@ -113,8 +114,7 @@ class LardHilbertMap(MapQueries):
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, no points,
-                num_clusters is not a positive integer, or other invalid or exclusive arguments.
+            ValueError: invalid or no points, invalid labels or num_clusters, or exclusive arguments.
 
         Source: Guizilini & Ramos 2016, Sections II and III.
         """
@@ -270,15 +270,15 @@ class LardHilbertMap(MapQueries):
         seed: int = 0,
         channels: Channels | None = None,
         time: float | None = None,
+        rays: Scans | None = None,
         config: UpdateConfig | None = None,
     ) -> LardHilbertMap:
         """Update the map with one more scan. On an empty map this is `fit`.
 
-        Each cluster keeps a bounded random sample of its points, the kept points. New points are added
-        to it, clusters near the new points are regrouped, and their weights are trained on the kept
-        points. Obstacles that scans contradict disappear after a few updates. Parameters remain the
-        same objects (see `parameters.resize_optimizer`). The last rows take the places of removed
-        clusters. If anything fails, nothing changes.
+        Each cluster keeps a bounded random sample of its points. New points are added to it, clusters
+        near them are regrouped, and their weights are trained on the kept points. Obstacles that scans
+        contradict disappear. Parameters remain the same objects (`parameters.resize_optimizer`). The
+        last rows take the places of removed clusters. If anything fails, nothing changes.
 
         Args:
             points: (N, D) world positions [m]; an empty set leaves the map unchanged.
@@ -287,14 +287,14 @@ class LardHilbertMap(MapQueries):
             seed: random seed of clustering and training.
             channels: see `fit`; channels and classes that are new to the map are added to it.
             time: time stamp of the scan [s]; required if the map has a ``max_age``.
-            config: update settings; `UpdateConfig(as_in_paper=True)` selects Algorithm 2 of the paper.
+            rays: the scan of the points; obstacles that its rays pass through disappear sooner.
+            config: settings; `UpdateConfig(as_in_paper=True)` selects Algorithm 2 of the paper.
 
         Returns:
             This map.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinite points, labels other than 0, 1/2 and 1, num_clusters
-                is not a positive integer, a channel is invalid, or a time is missing.
+            ValueError: invalid points, labels, num_clusters, channels or rays, or a missing time.
 
         Source: Guizilini & Ramos 2016, Section III and Algorithm 2.
         """
@@ -313,7 +313,7 @@ class LardHilbertMap(MapQueries):
         hits = channel_sums.hits_with_channels(*samples[:2], channels)
         state = parameters.read_state(self)
         state, layout = channel_sums.with_layout_of(hits, state, self.channel_layout)
-        changes = updated(state, *samples[:2], num_clusters, task)
+        changes = updated(state, *samples[:2], num_clusters, task, lines_of(rays, self.origin))
         part = channel_sums.with_hits(changes.part, layout, hits)
         part = aging.timed(part, *samples[:2], self.kernel, time)
         parameters.write_rows(self, changes.where, part, changes.removed, layout)

@@ -187,6 +187,7 @@ def _learn(model: LardHilbertMap, scan: Scans, number: int, config: StreamConfig
         seed=seed,
         channels=samples.channels,
         time=None if scan.times is None or scan.times.isnan().any() else float(scan.times.max()),
+        rays=scan,
         config=config.update,
     )
     if config.radius is not None:

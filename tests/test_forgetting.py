@@ -13,7 +13,16 @@ from lardhm_torch import (
 from lardhm_torch.learning import parameters
 from lardhm_torch.learning.clustering import cluster_points
 from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
-from lardhm_torch.learning.forgetting import DOUBT, GONE, OVERRULED, doubted, forget, trust
+from lardhm_torch.learning.forgetting import (
+    DOUBT,
+    GONE,
+    OVERRULED,
+    RAY,
+    URGENT,
+    doubted,
+    forget,
+    trust,
+)
 from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.learning.regrouping import Rule, _divide
 
@@ -67,9 +76,10 @@ def test_trust_in_a_contradicted_cluster_falls_and_returns_with_a_hit():
     doubted_part = replace(part, doubts=torch.full_like(part.doubts, 2 * DOUBT))
     after = forget(doubted_part, part.doubts)
     assert torch.equal(after.evidence, part.evidence)
-    assert torch.equal(after.fresh, kept_counts(part.evidence).to(after.fresh))
+    urgent = URGENT * kept_counts(part.evidence).to(after.fresh)
+    assert torch.equal(after.fresh, urgent)
     again = forget(replace(after, doubts=part.doubts, fresh=part.fresh), after.doubts)
-    assert torch.equal(again.fresh, kept_counts(part.evidence).to(after.fresh))
+    assert torch.equal(again.fresh, urgent)
     assert torch.equal(forget(part, part.doubts).fresh, part.fresh)
 
 
@@ -133,6 +143,19 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     assert (trust(hit_again.doubts) == 1).all()
     nothing_there = forgetting_state(known, hits, torch.zeros(600), kernel)
     assert (trust(nothing_there.doubts) == 1).all()
+
+
+def test_rays_through_a_cluster_count_until_it_is_hit():
+    known, kernel = known_wall(), LardHilbertMap().kernel
+    index = native.build_index(known.centers, kernel.num_neighbors)
+    free = known.centers + torch.tensor([9.0, 0, 0], dtype=F64)
+    passed = torch.tensor([1, 1, 3])
+    doubts = doubted(known, free, torch.zeros(4), kernel, index, passed)
+    assert torch.equal(doubts, RAY * torch.tensor([0.0, 2, 0, 1], dtype=F64))
+    known = replace(known, doubts=doubts)
+    hit = doubted(known, known.means[1:2], torch.ones(1), kernel, index, passed)
+    assert hit[1] == 0
+    assert hit[3] == 2 * RAY
 
 
 def forgetting_state(known, points, labels, kernel):

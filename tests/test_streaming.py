@@ -62,7 +62,7 @@ def test_a_stream_is_one_update_after_the_other(folder, whole):
     model = LardHilbertMap()
     for seed, scan in enumerate(iter_scans(folder)):
         samples = sample_rays(scan, seed=seed)
-        model.update(samples.points, samples.labels, seed=seed)
+        model.update(samples.points, samples.labels, seed=seed, rays=scan)
     assert same_map(model, LardHilbertMap.load(whole))
 
 

@@ -26,10 +26,10 @@ from lardhm_torch.learning.fitting import (
     fit_weights,
 )
 from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.passing import lines_of
 from lardhm_torch.learning.points import at_most
 from lardhm_torch.learning.tuning_steps import Batches, Moving, Plan, to_rows, tuning_steps
 from lardhm_torch.native.crossings import Lines
-from lardhm_torch.sampling import SamplingConfig, usable_rays
 from lardhm_torch.scans import Scans
 
 MAX_RAYS = 20_000  # the map is asked about so many rays, drawn at random
@@ -53,29 +53,15 @@ class Pierced(NamedTuple):
 
 
 def ray_lines(scans: Scans | None, origin: Tensor, task: FitTask) -> Lines | None:
-    """The rays of scans in the frame of a map, as far as they were seen to go.
-
-    Args:
-        scans: later returns and rays that are not sampled are left out. None: no rays, None.
-        origin: (D,) float64, the map's origin [m].
-        task: settings of the fit.
+    """The rays of scans in the frame of a map, see `passing.lines_of`. None: no rays, None.
 
     Raises:
         ValueError: the map would have fewer clusters, whose shapes are trained anyway; or the scans do
             not have its dimension.
     """
-    if scans is None:
-        return None
-    if task.config.shape_passes:
+    if scans is not None and task.config.shape_passes:
         raise ValueError("rays must be None if config.shape_passes is not 0; got both")
-    if scans.dim != len(origin):
-        raise ValueError(f"rays must have the {len(origin)} dimensions of the map; got {scans.dim}")
-    limits = SamplingConfig()
-    rays = (usable_rays(scans, limits)[0] & (scans.target_index == 1)).nonzero().squeeze(1)
-    starts, ends = (part[rays].to(origin) for part in (scans.ray_origins, scans.ends))
-    ranges = torch.linalg.vector_norm(ends - starts, dim=1)
-    reach = ranges.clamp(max=limits.max_range)
-    return Lines(starts - origin, (ends - starts) / ranges[:, None], reach)
+    return lines_of(scans, origin)
 
 
 def cleared(state: MapState, samples: Batched, task: FitTask, rays: Lines) -> MapState:

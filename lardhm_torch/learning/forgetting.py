@@ -1,9 +1,10 @@
 """Forgetting: kept points that a new scan contradicts.
 
-For each occupied cluster, the free points near its center are counted since its last hit (``doubts``).
-Above `DOUBT`, its kept points have less weight in training, so a removed obstacle disappears after a few
-scans, no matter how long it was observed before. A hit restores the weight, so rays at grazing incidence
-do not erase a wall. Points of unknown clusters are removed if the map predicts them as free or occupied.
+For each occupied cluster, the rays that pass through it since its last hit are counted (``doubts``), or
+the free points near its center if the rays are not known. Above `DOUBT`, its kept points have less
+weight in training, so a removed obstacle disappears after a few scans, no matter how long it was observed
+before. A hit restores the weight. Points of unknown clusters are removed if the map predicts them as free
+or occupied.
 """
 
 from __future__ import annotations
@@ -23,17 +24,25 @@ from lardhm_torch.sampling import UNKNOWN
 HIT = 0.1  # sum of the features of hits above which a cluster was hit
 NARROWEST = 0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones
 EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
+RAY = 0.5  # a ray through a cluster, compared with a free point at its center
 DOUBT = 3.0  # free points at the center of a cluster, since its last hit, that contradict it
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
+URGENT = 1000  # clusters whose trust changed are trained before others
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
 
 
 def doubted(
-    known: MapState, points: Tensor, labels: Tensor, kernel: Kernel, index: Tensor
+    known: MapState,
+    points: Tensor,
+    labels: Tensor,
+    kernel: Kernel,
+    index: Tensor,
+    passed: Tensor | None = None,
 ) -> Tensor:
-    """(M,) free points at the center of each occupied cluster since its last hit.
+    """(M,) evidence against each occupied cluster since its last hit.
 
-    A point counts with its feature, which is 1 at the center of a cluster and falls to 0.
+    A ray that passed through it counts as `RAY`. If the rays are not known, free points are counted, each
+    with its feature, which is 1 at the center of a cluster and falls to 0.
 
     Args:
         known: M clusters.
@@ -41,14 +50,19 @@ def doubted(
         labels: (N,) 1 occupied, 0 free, 1/2 unknown.
         kernel: kernel settings of the map.
         index: search index of the centers, see `native.build_index`.
+        passed: (P,) clusters that rays passed through, see `passing.passed_clusters`; None: not known.
     """
     if len(known) == 0 or not bool((labels != UNKNOWN).any()):
         return known.doubts
-    kernel = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
-    parameters = (known.centers, known.raw_scale_tril, known.is_occupied, kernel, index)
     hits, free, _ = split_labels(points, labels)
-    hit, passed = (feature_sums(part, *parameters) for part in (hits, free))
-    doubts = torch.where(hit > HIT, 0, known.doubts + passed)
+    wide = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
+    shapes = (known.centers, known.raw_scale_tril, known.is_occupied)
+    if passed is None:
+        hit, more = (feature_sums(part, *shapes, wide, index) for part in (hits, free))
+    else:
+        hit = feature_sums(hits, *shapes, wide._replace(covariance_scale=1.0), index)
+        more = RAY * torch.bincount(passed, minlength=len(known))
+    doubts = torch.where(hit > HIT, 0, known.doubts + more)
     return doubts * known.is_occupied
 
 
@@ -86,5 +100,5 @@ def forget(known: MapState, before: Tensor) -> MapState:
         known,
         evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
-        fresh=known.fresh.index_copy(0, rows, kept.to(known.fresh)),
+        fresh=known.fresh.index_copy(0, rows, (URGENT * kept).to(known.fresh)),
     )

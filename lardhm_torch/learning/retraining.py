@@ -62,6 +62,8 @@ def retrained(
     factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
     factors = factors.index_select(0, owners)
+    represented = float((strength * sizes).sum())
+    config = replace(config, l2=config.l2 * len(points) / represented)
     config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
     weights, (rows, losses) = trained(state, index, (points, labels, factors), task)

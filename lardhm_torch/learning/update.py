@@ -28,11 +28,13 @@ from lardhm_torch.learning.clustering import (
 )
 from lardhm_torch.learning.evidence import keeps_points, kept_points, with_evidence
 from lardhm_torch.learning.fitting import FitConfig, FitTask
-from lardhm_torch.learning.forgetting import doubted, forget
+from lardhm_torch.learning.forgetting import doubted, forget, trust
 from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.passing import passed_clusters, still_unknown
 from lardhm_torch.learning.points import at_most, in_morton_order
 from lardhm_torch.learning.regrouping import Rule, regrouped
 from lardhm_torch.learning.retraining import balanced, retrained, trained
+from lardhm_torch.native.crossings import Lines
 from lardhm_torch.native.thinning import few_per_cell
 from lardhm_torch.sampling import UNKNOWN
 
@@ -47,7 +49,7 @@ class UpdateConfig:
 
     as_in_paper: bool = False  # cluster all new points and merge the clusters by Algorithm 2
     zeta: float = 1.0  # [m] maximum distance between merged clusters in Algorithm 2
-    split_loss: float = 0.01  # clusters whose points have a larger mean log-loss are divided
+    split_loss: float = 0.003  # clusters whose points have a larger mean log-loss are divided
     cell_edge: float = 0.05  # [m] in a cell of this edge, at most 4 new points of a class are used
     max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
     max_trained: int = 5_000  # maximum number of changed clusters to train; the others follow later
@@ -76,7 +78,12 @@ class Changes(NamedTuple):
 
 
 def updated(
-    state: MapState, points: Tensor, labels: Tensor, num_clusters: int | None, task: Task
+    state: MapState,
+    points: Tensor,
+    labels: Tensor,
+    num_clusters: int | None,
+    task: Task,
+    rays: Lines | None = None,
 ) -> Changes:
     """Update clusters and weights with one more scan.
 
@@ -90,6 +97,7 @@ def updated(
         num_clusters: maximum number of clusters near the points, over all classes; None: chosen
             from the number of hits there.
         task: kernel, settings, random generator.
+        rays: of the scan, in the map's frame; None: they are not known.
 
     Returns:
         The clusters near the points; see `parameters.write_rows`. New clusters take the rows of
@@ -109,7 +117,14 @@ def updated(
     points, labels = _thinned(points, labels, config, rng)
     points, labels = _still_unknown(part, points, labels, kernel, index)
     before = part.doubts
-    part = replace(part, doubts=doubted(part, points, labels, kernel, index))
+    if rays is None:
+        part = replace(part, doubts=doubted(part, points, labels, kernel, index))
+    else:
+        passed, places = passed_clusters(part, rays)
+        part = replace(part, doubts=doubted(part, points, labels, kernel, index, passed))
+        part = still_unknown(part, rays, kernel.min_lengthscale)
+        gone = points_where(places, trust(part.doubts)[passed] < 1)
+        points, labels = torch.cat([points, gone]), torch.cat([labels, labels.new_zeros(len(gone))])
     part, classes = forget(part, before), tuple(split_labels(points, labels))
     total = int(state.counts[state.is_occupied].sum())
     occupied, grows = _most_occupied(part, classes[0], num_clusters, total), num_clusters is None

@@ -20,6 +20,8 @@ TABLE_BITS = 24  # of a table of cells: a place shares its entry with few others
 PRIMES = (73856093, 19349669, 83492791)  # of the hash; Teschner et al. 2003
 PATCH_HITS = 16  # a patch has so many hits, and fewer than twice as many
 NEAR = 2.5  # standard deviations of a patch: nearer rays pass through it
+CORE = 1.5  # standard deviations of a cluster: rays that come so near pass through it
+THIN = 0.002  # [m] smallest standard deviation of a cluster: rays pass beside thin poles
 FLOOR = 0.01  # [m] smallest standard deviation of a patch
 FLAT = 0.3  # thickness of a flat patch, relative to its second largest extent
 ROUGH_PATCHES = 1024  # number of patches from which the scatter of hits is estimated
@@ -109,10 +111,15 @@ def find_patches(hits: Tensor) -> Patches:
     offsets = here - means[owners]
     scatters = here.new_zeros(count, dim, dim)
     scatters.index_add_(0, owners, offsets[:, :, None] * offsets[:, None])
-    covariances = scatters / (sizes - 1).clamp(min=1)[:, None, None]
-    covariances += FLOOR**2 * torch.eye(dim, dtype=hits.dtype, device=hits.device)
+    return patches_of(means, scatters / (sizes - 1).clamp(min=1)[:, None, None])
+
+
+def patches_of(means: Tensor, covariances: Tensor, floor: float = FLOOR) -> Patches:
+    """Patches with (L, D) means [m] and (L, D, D) covariances [m^2], to which ``floor``^2 is added."""
+    eye = torch.eye(means.shape[1], dtype=means.dtype, device=means.device)
+    covariances = covariances + floor**2 * eye
     variances, axes = native.symmetric_axes(covariances)
-    variances = variances.clamp(min=FLOOR**2)
+    variances = variances.clamp(min=floor**2)
     spread = variances.sqrt()
     precisions = (axes / variances[:, None]) @ axes.mT
     is_flat = spread[:, 0] < FLAT * spread[:, 1]
@@ -175,22 +182,83 @@ def passages(hits: Tensor, lines: Lines, ends: Tensor, margin: float) -> Passage
         margin: smallest distance of both ends of a ray from the plane [m].
     """
     if len(hits) < PATCH_HITS or len(ends) == 0:
-        none = torch.zeros(0, dtype=torch.long, device=ends.device)
-        return Passages(none, ends[:0], ends[:0], none.bool())
+        return _none(ends)
     corner = lines.starts.mean(dim=0)
     patches = find_patches(hits - corner)
     warn_of_units(patches, margin, len(lines.starts) == 1)
     lines = lines._replace(starts=lines.starts - corner)
-    half = NEAR * patches.covariances.diagonal(dim1=1, dim2=2).sqrt()
+    rays, leaves = crossed(patches, lines, ends, NEAR * patches.thickness + margin, NEAR)
+    return _places(rays, leaves, lines, patches)
+
+
+def passages_through(
+    means: Tensor, covariances: Tensor, lines: Lines, ends: Tensor, margin: float
+) -> tuple[Tensor, Passages]:
+    """Where rays pass through the cores of clusters: (P,) clusters and places; see `passages`.
+
+    The core of a cluster is within one standard deviation. A cluster that is not flat is also passed by
+    rays that start and end on one side of it.
+
+    Args:
+        means: (M, D) [m].
+        covariances: (M, D, D) [m^2].
+        lines: R rays.
+        ends: (R,) depths before which space is free [m].
+        margin: smallest distance of both ends of a ray from the plane of a flat cluster [m].
+    """
+    if len(means) == 0 or len(ends) == 0:
+        found = _none(ends)
+        return found.rays, found
+    levels = (len(means) - 1).bit_length()
+    bounds = torch.arange((1 << levels) + 1, device=means.device) * len(means) >> levels
+    order = balanced_order(means, levels)[bounds[:-1]]  # a leaf without a cluster gets the next one
+    means, covariances = means[order], covariances[order]
+    patches = patches_of(means, covariances)
+    clear = torch.where(patches.is_flat, NEAR * patches.thickness + margin, -torch.inf)
+    thin = patches_of(means, covariances, THIN)
+    cores = patches._replace(precisions=thin.precisions, covariances=thin.covariances)
+    rays, leaves = crossed(cores, lines, ends, clear, CORE)
+    depths = _closest(rays, leaves, lines, cores)[0]
+    widths = _closest(rays, leaves, lines, patches)[1]
+    steep = (lines.ahead[rays] * patches.normals[leaves]).sum(dim=1) / patches.thickness[leaves]
+    is_flat = patches.is_flat[leaves]
+    through = ~is_flat | ((steep * widths) ** 2 > 0.5)  # else it grazes the plane
+    through &= (bounds.diff() > 0)[leaves]
+    columns = (rays, depths, widths, is_flat)
+    return order[leaves][through], Passages(*(column[through] for column in columns))
+
+
+def _none(ends: Tensor) -> Passages:
+    none = torch.zeros(0, dtype=torch.long, device=ends.device)
+    return Passages(none, ends[:0], ends[:0], none.bool())
+
+
+def crossed(
+    patches: Patches, lines: Lines, ends: Tensor, clear: Tensor, near: float
+) -> tuple[Tensor, Tensor]:
+    """(P,) rays and (P,) patches that they pass through; see `passages`.
+
+    Args:
+        patches: a power of two of them, in the order of a tree.
+        lines: R rays.
+        ends: (R,) depths before which space is free [m].
+        clear: (L,) smallest distance of both ends of a ray from the plane of a patch [m]; negative
+            infinity: they need not be on different sides.
+        near: standard deviations of a patch within which rays pass through it.
+    """
+    half = near * patches.covariances.diagonal(dim1=1, dim2=2).sqrt()
     boxes = (patches.means - half, patches.means + half)
-    clear = NEAR * patches.thickness + margin
-    if native.supports(hits):
+    if native.supports(patches.means):
         shapes = (patches.means, patches.precisions, patches.normals, clear)
-        rays, leaves = torch.ops.lardhm.passing(*lines, ends, *boxes, *shapes, NEAR)
-    else:
-        parts = torch.arange(len(ends), device=ends.device).split(CHUNK_RAYS)
-        found = [_passing(part, lines, ends, boxes, patches, clear) for part in parts]
-        rays, leaves = (torch.cat(part) for part in zip(*found, strict=True))
+        return torch.ops.lardhm.passing(*lines, ends, *boxes, *shapes, near)
+    parts = torch.arange(len(ends), device=ends.device).split(CHUNK_RAYS)
+    found = [_passing(part, lines, ends, boxes, patches, clear, near) for part in parts]
+    rays, leaves = (torch.cat(part) for part in zip(*found, strict=True))
+    return rays, leaves
+
+
+def _places(rays: Tensor, leaves: Tensor, lines: Lines, patches: Patches) -> Passages:
+    """Passages of pairs of a ray and a patch, at most `PATCH_HITS` of each patch."""
     kept = _spread(leaves, PATCH_HITS, len(patches.means))
     rays, leaves = rays[kept], leaves[kept]
     depths, widths, _ = _closest(rays, leaves, lines, patches)
@@ -204,6 +272,7 @@ def _passing(
     boxes: tuple[Tensor, Tensor],
     patches: Patches,
     clear: Tensor,
+    near: float,
 ) -> tuple[Tensor, Tensor]:
     """(P,) rays and (P,) patches that they pass through, of some rays; see `passages`."""
     rays, leaves = _boxes_met(rays, lines, ends, boxes)
@@ -213,7 +282,7 @@ def _passing(
     before = ((start - patches.means[leaves]) * normals).sum(dim=1)
     after = before + lines.reach[rays] * (ahead * normals).sum(dim=1)
     through = (before.minimum(after) < -clear[leaves]) & (before.maximum(after) > clear[leaves])
-    through &= (squared < NEAR**2) & (depths > 0) & (depths < ends[rays])
+    through &= (squared < near**2) & (depths > 0) & (depths < ends[rays])
     return rays[through], leaves[through]
 
 
