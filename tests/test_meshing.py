@@ -41,6 +41,7 @@ class GaussianMap(nn.Module):
 
 
 WEIGHT, SIGMA = 6.0, 0.3
+FLOOR_BOX = ([-0.5, -0.5, -0.6], [0.5, 0.5, 1.0])
 
 
 def ball(dim=3, origin=None):
@@ -134,7 +135,7 @@ def test_parts_of_a_map_fit_together():
     parts.append(extract_mesh(model, 0.04, bounds=(low, high)))
     assert min(len(part.faces) for part in parts) > 300
     assert sum(part.area for part in parts) == pytest.approx(whole.area, rel=0.01)
-    seams = [part.vertices[np.abs(part.vertices[:, 1] - ends[1]) < 1e-3] for part in parts]
+    seams = [part.vertices[np.abs(part.vertices[:, 1] - ends[1]) < 5e-3] for part in parts]
     distance, _ = cKDTree(seams[0]).query(seams[1])
     assert len(seams[1]) > 20
     assert (distance < 1e-3).mean() > 0.95  # all but the ends of the seam
@@ -142,7 +143,7 @@ def test_parts_of_a_map_fit_together():
 
 def test_following_finds_what_examining_every_block_finds():
     model = wall_map(dtype=torch.float32)
-    rule = following.Rule(0.0, 1, 1.0)
+    rule = following.Rule(0.0, 1, 0.0, 1.0)
     lattice = meshing.surface_lattice(model, 0.03)
     every = np.arange(int(lattice.shape.prod()))
     starts = following.seed_blocks(model, lattice, rule)
@@ -213,6 +214,37 @@ def test_faces_with_nothing_measured_before_or_behind_them_are_left_out():
     assert measured.triangles_center[:, 0].max() < 0
     middle = np.abs(measured.triangles_center[:, 1:]).max(axis=1) < 0.5
     assert (measured.face_normals[middle, 0] < -0.9).all()
+
+
+def thin_floor(below):
+    """A layer much thinner than a cell at z = 0.03, with free space above and this log-odds below."""
+    thin = torch.diag(torch.tensor([1.0, 1.0, 0.02]))
+    free = torch.diag(torch.tensor([1.0, 1.0, 0.2]))
+    centers = [[0.0, 0, 0.03], [0, 0, 0.38], [0, 0, -0.32]]
+    return GaussianMap(centers, torch.stack([thin, free, free]), [12.0, -8.0, below])
+
+
+def test_a_floor_thinner_than_a_cell_has_no_holes():
+    mesh = extract_mesh(thin_floor(0.0), 0.1, bounds=FLOOR_BOX)
+    assert mesh.area == pytest.approx(1.0, rel=0.05)
+    np.testing.assert_allclose(mesh.vertices[:, 2], 0.03, atol=0.01)
+
+
+def test_a_floor_has_faces_where_the_space_above_is_as_free_as_that_below():
+    mesh = extract_mesh(thin_floor(-8.0), 0.025, bounds=FLOOR_BOX)
+    up, down = (mesh.area_faces[sign * mesh.face_normals[:, 2] > 0].sum() for sign in (1, -1))
+    assert (up, down) == pytest.approx((1.0, 1.0), rel=0.05)
+
+
+def test_weak_traces_of_free_space_behind_a_floor_give_no_faces():
+    mesh = extract_mesh(thin_floor(-2.0), 0.025, bounds=FLOOR_BOX)
+    assert mesh.area == pytest.approx(1.0, rel=0.05)
+    assert (mesh.face_normals[:, 2] > 0.9).all()
+
+
+def test_vertices_where_the_log_odds_are_constant_have_no_ridge():
+    tiny = GaussianMap(torch.zeros(1, 3), 0.01 * torch.eye(3)[None], [WEIGHT])  # 0 at 0.4 m
+    assert len(extract_mesh(tiny, 0.4, log_odds_margin=None).faces) == 0
 
 
 def test_below_one_half_the_surface_bounds_the_known_free_space():
@@ -313,14 +345,13 @@ def test_the_mesh_of_a_room_lies_on_its_walls():
     train, _ = split_rays(simulate_room(seed=1), ratio=0.8, seed=1)
     samples = sample_rays(train, seed=1)
     model = LardHilbertMap().fit(samples.points, samples.labels, seed=1)
-    meshes = {
-        surface: extract_mesh(model, 0.05, surface=surface) for surface in ("peak", "crossing")
-    }
+    surfaces = ("peak", "crossing")
+    meshes = {surface: extract_mesh(model, 0.05, surface=surface) for surface in surfaces}
     scores = {
         surface: mesh_metrics(mesh, room_mesh(), train.hits) for surface, mesh in meshes.items()
     }
     assert meshes["peak"].area == pytest.approx(158.5, rel=0.05)  # what the sensors can see of it
-    assert facing_away(meshes["peak"], room_mesh()) < 0.015
+    assert facing_away(meshes["peak"], room_mesh()) < 0.01
     assert scores["peak"]["f_score_0.05"] > 0.85
     assert scores["peak"]["chamfer"] < 0.5 * scores["crossing"]["chamfer"]
 

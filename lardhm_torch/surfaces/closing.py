@@ -42,7 +42,7 @@ def closed_sheet(
         The surface, with ``closing``.
     """
     level = threshold_log_odds(threshold)
-    rule = Rule(level - log_odds_margin, 1, None, is_closed=True)
+    rule = Rule(level - log_odds_margin, 1, level, None, is_closed=True)
     starts = [seed_blocks(model, lattice, rule._replace(sign=sign)) for sign in (1, -1)]
     if lattice.is_cut:
         starts.append(border_blocks(lattice, *cluster_boxes(model, -1, lattice.bounds)))

@@ -57,7 +57,7 @@ def estimate_mesh(
             low, high = (end.to(centers) for end in bounds)
             chosen &= ((centers >= low) & (centers <= high)).all(dim=1)
         stds = torch.linalg.svdvals(piece.scale_tril[chosen].double())
-        areas.append((8 / covariance_scale(piece) * stds[:, 0] * stds[:, 1]).cpu())
+        areas.append((9 / covariance_scale(piece) * stds[:, 0] * stds[:, 1]).cpu())
     largest_last = torch.cat(areas).sort().values
     area = float(largest_last[: len(largest_last) - int(LARGEST * len(largest_last))].sum())
     area *= CLOSED if watertight else 1.0

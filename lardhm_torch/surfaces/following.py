@@ -22,8 +22,13 @@ from lardhm_torch.surfaces.marching import Faces, march_blocks
 
 BATCH_BLOCKS = 1024  # examined at a time
 REGION_EDGE = 10.0  # [m] within which the surface is followed before other tiles are loaded
-PROBES = (1.0, 2.0, 3.0)  # standard deviations in front of and behind a vertex, where it is tested
-FREE_FACTOR = 2.0  # on the margin in front, where free space can leak through walls
+FRONT, BEHIND, BEYOND = (
+    (1.0, 2.0),
+    (1.0, 2.0, 3.0),
+    (4.0, 6.0, 8.0),
+)  # [std] from a vertex, where tested
+FREE_FACTOR = 3.0  # on the margin in front, where free space can leak through walls
+FREER = 2.0  # times as far below the level as beyond the surface: so much suffices in front, too
 LEAST_SHARE = 0.01  # of a lattice edge between its end and a vertex of a closed surface
 SEED_RADII = torch.linspace(0, 4.5, 10)  # standard deviations from a center
 SEED_CLUSTERS = 1 << 12  # whose lines are evaluated at a time
@@ -41,26 +46,28 @@ class Rule(NamedTuple):
     """Which part of which level set is followed.
 
     Attributes:
-        level: log-odds of the surface.
+        level: log-odds of the level set.
         sign: of the weights of the supporting clusters.
-        log_odds_margin: required beyond the level on both sides of a face; None: none.
+        threshold: log-odds of the surface, which is behind the level set or on it.
+        log_odds_margin: required beyond the threshold on both sides of a face; None: none.
         is_closed: whether the border of the lattice is above the level, so that the surface ends nowhere.
     """
 
     level: float
     sign: int
+    threshold: float
     log_odds_margin: float | None
     is_closed: bool = False
 
     @property
-    def lowest(self) -> float:
-        """Log-odds below which space in front of a face is known to be free."""
-        return self.level - FREE_FACTOR * (self.log_odds_margin or 0.0)
+    def free(self) -> float:
+        """Log-odds below which space can be free: unknown space never is."""
+        return min(self.threshold, 0.0)
 
     @property
     def highest(self) -> float:
-        """Log-odds above which space behind a face is known to be occupied."""
-        return self.level + (self.log_odds_margin or 0.0)
+        """Log-odds above which space behind a face is known to be occupied, as for `raycast`."""
+        return self.threshold + (self.log_odds_margin or 0.0)
 
 
 class Sheet(NamedTuple):
@@ -100,9 +107,11 @@ def follow_surface(
 ) -> Sheet:
     """The parts of a level set that can be reached from some blocks over supported faces.
 
-    A vertex is supported if, within three standard deviations of the nearest supporting cluster (its
-    smallest), the log-odds exceed the level by ``log_odds_margin`` behind it, and fall below it by
-    `FREE_FACTOR` times as much in front of it. A face is kept if its three vertices are supported.
+    Lengths are standard deviations of the nearest supporting cluster (the smallest). A vertex is
+    supported if the log-odds exceed the threshold by ``log_odds_margin`` within three of them behind it,
+    and if the space up to two of them in front is free: the log-odds are `FREE_FACTOR` margins below the
+    threshold, or `FREER` times as far below it as beyond the surface, four to eight of them behind the
+    vertex. A face is kept if its three vertices are supported.
 
     Args:
         model: the map.
@@ -139,8 +148,8 @@ def seed_blocks(model: OccupancyMap, lattice: Lattice, rule: Rule) -> np.ndarray
 
     From each center, two lines run along the shortest principal axis, as far as `SEED_RADII`. If they do
     not cross the surface, lines along the other axes and between all three follow. One of several
-    clusters that reach the same blocks is enough. Lines without the margin on either side of the level
-    count only if none is required.
+    clusters that reach the same blocks is enough. Lines without the margin above the threshold count only
+    if none is required.
     """
     found = [np.zeros(0, dtype=np.int64)]
     for piece in pieces(model, lattice.bounds if lattice.is_cut else None):
@@ -174,7 +183,6 @@ def _crossed(model: OccupancyMap, lines: Tensor, rule: Rule) -> tuple[Tensor, Te
     crossed = inside[1:] != inside[:-1]
     if rule.log_odds_margin is not None:
         crossed &= log_odds.amax(dim=0) > rule.highest
-        crossed &= log_odds.amin(dim=0) < rule.lowest
     return crossed.any(dim=2).any(dim=0), torch.cat([lines[1:][crossed], lines[:-1][crossed]])
 
 
@@ -246,16 +254,21 @@ class _Follower:
         return -torch.nn.functional.normalize(gradient, dim=1)
 
     def _supported(self, points: Tensor, normals: Tensor, thickness: Tensor) -> Tensor:
-        """Ascending rows of the points with the margin in front of them and behind them."""
-        rows = torch.arange(len(points), device=points.device)
-        if self.rule.log_odds_margin is None:
+        """Ascending rows of the points with free space in front of them and occupied space behind."""
+        rows, rule = torch.arange(len(points), device=points.device), self.rule
+        if rule.log_odds_margin is None:
             return rows
         steps = normals * thickness[:, None]
-        depths = torch.tensor(PROBES, dtype=torch.float64, device=points.device)[:, None, None]
-        in_front = self.model.log_odds(points + depths * steps).amin(dim=0)
-        rows = rows[in_front < self.rule.lowest]
-        behind = self.model.log_odds(points[rows] - depths * steps[rows]).amax(dim=0)
-        return rows[behind > self.rule.highest]
+
+        def log_odds(distances: tuple[float, ...]) -> Tensor:
+            factors = torch.tensor(distances, dtype=torch.float64, device=points.device)
+            return self.model.log_odds(points[rows] + factors[:, None, None] * steps[rows])
+
+        rows = rows[log_odds(tuple(-distance for distance in BEHIND)).amax(dim=0) > rule.highest]
+        in_front = log_odds(FRONT).amin(dim=0) - rule.free
+        beyond = log_odds(tuple(-distance for distance in BEYOND)).amin(dim=0) - rule.free
+        is_free = in_front < -FREE_FACTOR * rule.log_odds_margin
+        return rows[is_free | (in_front < FREER * beyond.clamp(max=0))]
 
 
 class _Batch(NamedTuple):

@@ -54,22 +54,23 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """Surface mesh of occupied space; normals point into free space.
 
-    The level set of the log-odds at the threshold is followed from block to block by marching cubes,
-    beginning near the supporting clusters: those with positive weights for a threshold of 1/2 or more,
-    with negative ones below. Time and memory grow with the surface. Then
+    A level set of the log-odds is followed from block to block by marching cubes, beginning near the
+    supporting clusters: those with positive weights for a threshold of 1/2 or more, with negative ones
+    below. Time and memory grow with the surface.
 
-    - ``surface="peak"`` moves every vertex to the ridge of the log-odds behind it, where the hits
-      lie, and removes faces whose corners have no common ridge (`ridge.sheet_on_ridge`). Both faces
-      of an object thinner than the kernels meet in its middle.
-    - ``surface="crossing"`` keeps the level set. At 1/2 it lies 5 to 10 cm in front of the surface,
-      because free space is learned only up to some centimeters before the hits. It encloses
+    - ``surface="peak"`` follows the border of known free space, ``log_odds_margin`` below the threshold,
+      and moves every vertex to the ridge of the log-odds behind it, where the hits lie and `raycast`
+      ends. It removes faces whose corners have no common ridge (`ridge.sheet_on_ridge`). Both faces of
+      an object thinner than the kernels meet in its middle.
+    - ``surface="crossing"`` is the level set at the threshold. At 1/2 it lies 5 to 10 cm in front of the
+      surface, because free space is learned only up to some centimeters before the hits. It encloses
       everything occupied, which is conservative for a robot.
 
-    A face is kept only if there is measured occupied space behind it and free space in front of it.
-    Within three standard deviations (the smallest) of the nearest supporting cluster, the log-odds must
-    exceed those of the threshold by ``log_odds_margin`` behind each vertex, and fall below them by twice
-    as much in front. Without this rule, there would be faces in unmeasured space, where the log-odds
-    vary around 0, and on the backs of walls. The rule does not depend on the resolution.
+    A face is kept only if there is measured occupied space behind it, by the margin of `raycast`, and
+    free space in front of it, three margins below the threshold or twice as far below it as the space
+    beyond the surface (`following.follow_surface`). Without this rule, there would be faces in unmeasured
+    space, where the log-odds vary around 0, and on the backs of walls. The rule does not depend on the
+    resolution.
 
     A mesh of measured surfaces is open where nothing was measured. With ``watertight``, it is the whole
     boundary of the space known to be free (by one margin), which counts everything else as occupied and
@@ -78,8 +79,8 @@ def extract_mesh(
 
     Args:
         model: a 3-D map.
-        resolution: edge of a lattice cell [m]. With cells much larger than the thickness of a
-            surface (standard deviation of its clusters across it), the mesh has holes.
+        resolution: edge of a lattice cell [m]. Objects with free space on both sides that are much
+            thinner than a cell get holes.
         threshold: space with a higher probability is occupied, between 0 and 1.
         bounds: lower and upper corner of the part to mesh, world frame [m]; None: all of the map.
         surface: "peak" or "crossing", as for `raycast`.
@@ -168,9 +169,8 @@ def surface_lattice(
         first, last = np.round(low / resolution), np.round(high / resolution)
         core = np.stack([first, np.maximum(last, first + 1)]).astype(np.int64)
     if not watertight:  # blocks are the same in all parts of a map
-        around = 0 if core is None else RIM
-        first = np.floor((first - around) / BLOCK_CELLS) * BLOCK_CELLS
-        last = np.ceil((last + around) / BLOCK_CELLS) * BLOCK_CELLS
+        first = np.floor((first - RIM) / BLOCK_CELLS) * BLOCK_CELLS
+        last = np.ceil((last + RIM) / BLOCK_CELLS) * BLOCK_CELLS
     cells = (last - first).clip(min=1).astype(np.int64)
     return Lattice(first.astype(np.int64), cells, resolution, keep=keep, core=core)
 
@@ -212,7 +212,9 @@ def lattice_mesh(
             margin = log_odds_margin or 0.0
             sheet = closed_sheet(model, lattice, threshold, margin, on_ridge=on_ridge, report=count)
         else:
-            level = _open_sheet(model, lattice, threshold, log_odds_margin, count)
+            level = _open_sheet(
+                model, lattice, threshold, log_odds_margin, count, from_free=on_ridge
+            )
             sheet = sheet_on_ridge(model, level, lattice.resolution) if on_ridge else level
             if lattice.is_cut:
                 inside = lattice.in_core(level.vertices[sheet.faces].mean(axis=1))
@@ -243,9 +245,13 @@ def _open_sheet(
     threshold: float,
     log_odds_margin: float | None,
     report: Callable[[int], object],
+    *,
+    from_free: bool,
 ) -> Sheet:
-    """The measured parts of the level set at a threshold."""
-    rule = Rule(threshold_log_odds(threshold), _sign(threshold), log_odds_margin)
+    """The measured parts of the level set at a threshold, or of the border of free space before it."""
+    level = threshold_log_odds(threshold)
+    followed = min(level, 0.0) - log_odds_margin if from_free and log_odds_margin else level
+    rule = Rule(followed, _sign(threshold), level, log_odds_margin)
     boxes = cluster_boxes(model, rule.sign, lattice.bounds if lattice.is_cut else None)
     if log_odds_margin is None:
         starts = blocks_near_boxes(lattice, *boxes)

@@ -86,7 +86,8 @@ def sheet_on_ridge(model: OccupancyMap, sheet: Sheet, resolution: float) -> Shee
     """
     vertices, faces, normals, thickness, _ = sheet
     normals = mean_with_neighbors(normals, faces)
-    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)  # 0 where the log-odds are constant
+    normals = (normals / lengths.clip(min=1e-12)).astype(np.float32)
     columns = (torch.from_numpy(c).to(model.origin.device) for c in (vertices, normals, thickness))
     depths = ridge_depths(model, *columns).cpu().numpy()
     depths = mean_with_neighbors(depths[:, None], faces)
