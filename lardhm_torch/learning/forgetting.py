@@ -2,9 +2,10 @@
 
 For each occupied cluster, the scans with rays that pass through it since its last hit are counted, or
 the free points near its center if the rays are not known. ``doubts`` is that count relative to a third of
-the binary logarithm of the number of its hits. Above `DOUBT`, the kept points have less weight in training,
-so a removed obstacle disappears after a few scans, a little later if it was observed for long. A hit
-restores the weight. Points of unknown clusters are removed if the map predicts them as free or occupied.
+the binary logarithm of the number of its hits. Above `DOUBT`, the kept points have less weight in
+training, so a removed obstacle disappears after a few scans, a little later if it was observed for long.
+A hit restores the weight. Points of unknown clusters are removed if the map predicts them as free or
+occupied.
 """
 
 from __future__ import annotations
