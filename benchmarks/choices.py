@@ -89,7 +89,6 @@ CHOICES = {
     "no near samples": Choice(sampling={"near_samples": 0}),
     "1 near sample": Choice(sampling={"near_samples": 1}),
     "3 free samples per ray": Choice(sampling={"free_samples": 3}),
-    "6 free samples per ray": Choice(sampling={"free_samples": 6}),
     "near margin 0.2 m": Choice(sampling={"near_margin": 0.2}),
     "near margin 0.05 m": Choice(sampling={"near_margin": 0.05}),
     "equal class weights": Choice(fit={"occupied_share": 0.5}, tune={"occupied_share": 0.5}),

@@ -26,7 +26,7 @@ class SamplingConfig:
 
     min_range: float = 0.3  # [m] shorter rays end on the robot itself and are dropped
     max_range: float = 100.0  # [m] longer rays are truncated and count as no-return
-    free_samples: int = 5  # free samples per ray, one in each of as many equal sections
+    free_samples: int = 6  # free samples per ray, one in each of as many equal sections
     near_samples: int = 2  # free samples close in front of each hit
     near_margin: float = 0.15  # [m] minimum distance of free samples from the hit of their ray
     near_reach: float = 0.6  # [m] maximum distance of near samples from the hit

@@ -23,8 +23,9 @@ def samples(rays):
     return sample_rays(rays[0])
 
 
-def fitted(samples, **settings):
-    model = LardHilbertMap().fit(samples.points, samples.labels, config=FitConfig(**settings))
+def fitted(samples, adapt_shapes=True):
+    config = FitConfig(adapt_shapes=adapt_shapes)
+    model = LardHilbertMap().fit(samples.points, samples.labels, config=config)
     return model.requires_grad_(False)
 
 

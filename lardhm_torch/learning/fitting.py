@@ -56,8 +56,8 @@ class FitConfig:
     # is chosen by the held-out loss of a coarse map (`scene_clusters`). Probabilities are as accurate,
     # but ranges and meshes are less exact. 4 is recommended; 0: off.
     shape_passes: int = 0
-    # also train centers and length scales of other maps, after half of the passes (`shaping`)
-    adapt_shapes: bool = True
+    # also train centers and length scales (`shaping`): lower log-loss, but updates lose thin poles
+    adapt_shapes: bool = False
 
     def rows_per_batch(self, num_points: int) -> int:
         """Points per step: about ``batch_size``, with equally large batches in each pass."""

@@ -147,7 +147,7 @@ def _divide(known: MapState, rule: Rule) -> Groups:
     balanced = (sizes.amin(dim=0) >= MIN_COUNT).nonzero().squeeze(1)
     chosen, first, second = chosen[balanced], first[balanced], second[balanced]
     sizes = sizes[:, balanced]
-    parents, shares = light.rows(chosen), sizes / sizes.sum(dim=0)
+    parents, shares = light.rows(chosen), sizes.double() / sizes.sum(dim=0)
     of_parents = kinds[chosen]
     parts = [
         _half(parents, of_parents, evidence, share, rule)

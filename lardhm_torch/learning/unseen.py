@@ -26,8 +26,8 @@ INSIDE = 6.0  # standard deviations from a surface's cluster: nothing there is u
 SURFACE = 0.25  # [m] ... nor farther than this from its plane: wider clusters are no surfaces
 TAILS = (2.0, 5.0)  # standard deviations from a cluster: where its tail is
 TAIL_FEATURE = 0.4  # no cluster holds a place where no feature is larger
-TAILS_PER_CLUSTER = 2  # at least ...
-SAMPLES_PER_TAIL = 28  # ... and one for so many samples, so that large clusters have enough
+TAILS_PER_CLUSTER = 3  # at least ...
+SAMPLES_PER_TAIL = 14  # ... and one for so many samples, so that large clusters have enough
 
 
 def even_kernels(state: MapState, floor: float) -> MapState:
