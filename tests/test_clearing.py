@@ -18,7 +18,6 @@ from lardhm_torch.learning.fitting import FitTask
 from lardhm_torch.learning.parameters import read_state
 
 F64 = torch.float64
-ALONE = FitConfig(adapt_shapes=False)
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +32,12 @@ def samples(room):
 
 @pytest.fixture(scope="module")
 def plain(samples):
-    model = LardHilbertMap().fit(samples.points, samples.labels, config=ALONE)
-    return model.requires_grad_(False)
+    return LardHilbertMap().fit(samples.points, samples.labels).requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
 def clear(samples, room):
-    model = LardHilbertMap().fit(samples.points, samples.labels, rays=room, config=ALONE)
-    return model.requires_grad_(False)
+    return LardHilbertMap().fit(samples.points, samples.labels, rays=room).requires_grad_(False)
 
 
 def early(model, scans):

@@ -135,7 +135,7 @@ def test_parts_of_a_map_fit_together():
     parts.append(extract_mesh(model, 0.04, bounds=(low, high)))
     assert min(len(part.faces) for part in parts) > 300
     assert sum(part.area for part in parts) == pytest.approx(whole.area, rel=0.01)
-    seams = [part.vertices[np.abs(part.vertices[:, 1] - ends[1]) < 5e-3] for part in parts]
+    seams = [part.vertices[np.abs(part.vertices[:, 1] - ends[1]) < 2e-3] for part in parts]
     distance, _ = cKDTree(seams[0]).query(seams[1])
     assert len(seams[1]) > 20
     assert (distance < 1e-3).mean() > 0.95  # all but the ends of the seam

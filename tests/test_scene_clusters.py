@@ -20,9 +20,10 @@ from lardhm_torch.learning.sized_maps import SMALL
 KERNEL = Kernel(16, 2.5, 0.01)
 
 
-def task(seed=0, shape_passes=4, adapt_shapes=True):
-    config = FitConfig(shape_passes=shape_passes, adapt_shapes=adapt_shapes)
-    return FitTask(KERNEL, config, torch.Generator().manual_seed(seed))
+def task(seed=0, shape_passes=4):
+    return FitTask(
+        KERNEL, FitConfig(shape_passes=shape_passes), torch.Generator().manual_seed(seed)
+    )
 
 
 def striped(stripes, count=20_000, seed=0):
@@ -73,7 +74,6 @@ def test_the_moments_stay_those_of_the_points():
 )  # fmt: skip
 def test_otherwise_the_map_is_that_of_fit_clusters(settings, num_clusters, count):
     points, labels = striped(2, count)
-    settings = {"adapt_shapes": False, **settings}
     ours = fit_scene(points, labels, num_clusters, task(**settings))
     theirs = fit_clusters(points, labels, num_clusters, task(**settings))
     for one, other in zip(ours, theirs, strict=True):

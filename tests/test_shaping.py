@@ -11,6 +11,7 @@ from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import training_points
 
 F64 = torch.float64
+ADAPTED = FitConfig(adapt_shapes=True)
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +24,7 @@ def samples(rays):
     return sample_rays(rays[0])
 
 
-def fitted(samples, adapt_shapes=True):
-    config = FitConfig(adapt_shapes=adapt_shapes)
+def fitted(samples, config=ADAPTED):
     model = LardHilbertMap().fit(samples.points, samples.labels, config=config)
     return model.requires_grad_(False)
 
@@ -41,7 +41,7 @@ def adapted(samples):
 
 @pytest.fixture(scope="module")
 def plain(samples):
-    return fitted(samples, adapt_shapes=False)
+    return fitted(samples, FitConfig())
 
 
 def test_held_out_rays_are_predicted_better(rays, adapted, plain):
@@ -75,7 +75,7 @@ def test_of_many_points_those_of_the_first_batches_train_the_shapes(
 def test_few_points_can_be_fitted(dim, count):
     points = torch.randn(count, dim, generator=torch.Generator().manual_seed(0))
     labels = (torch.arange(count) % 2).float()
-    model = LardHilbertMap(dim=dim).fit(points, labels)
+    model = LardHilbertMap(dim=dim).fit(points, labels, config=ADAPTED)
     assert bool(model(points).isfinite().all())
 
 
@@ -86,7 +86,7 @@ def test_plain_torch_gives_the_same_map(ops, samples, monkeypatch):
     )
 
     def fit() -> MapState:
-        task = FitTask(LardHilbertMap().kernel, FitConfig(), torch.Generator().manual_seed(0))
+        task = FitTask(LardHilbertMap().kernel, ADAPTED, torch.Generator().manual_seed(0))
         return scene_clusters.fit_scene(points, labels, 40, task)
 
     fast = fit()

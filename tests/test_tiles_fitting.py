@@ -81,8 +81,7 @@ def test_a_map_of_tiles_is_as_good_as_one_map(tmp_path):
     (piece,) = room_pieces(6_000, 1)
     train, test = split_rays(piece, 0.5)
     samples = sample_rays(train)
-    alone = FitConfig(adapt_shapes=False)  # shapes of tiles are those of their points
-    single = evaluate(LardHilbertMap().fit(samples.points, samples.labels, config=alone), test)
+    single = evaluate(LardHilbertMap().fit(samples.points, samples.labels), test)
     tile_scans([train], tmp_path / "room", TilingConfig(edge=5.0))
     fit_tiles(tmp_path / "room")
     tiled = evaluate(TiledMap.open(tmp_path / "room"), test)
@@ -96,8 +95,7 @@ def test_real_scans_lose_nothing_by_being_cut_into_tiles(data, tmp_path, name, e
     rays = protocol_rays(load_scans(data / name / "scans.npz"), 120_000)
     train, test = split_rays(rays, 0.5)
     samples = sample_rays(train, SamplingConfig(behind_samples=0))  # tiles learn no unknown points
-    alone = FitConfig(adapt_shapes=False)  # shapes of tiles are those of their points
-    single = evaluate(LardHilbertMap().fit(samples.points, samples.labels, config=alone), test)
+    single = evaluate(LardHilbertMap().fit(samples.points, samples.labels), test)
     tile_scans([train], tmp_path / name, TilingConfig(edge=edge))
     fit_tiles(tmp_path / name)
     tiled = evaluate(TiledMap.open(tmp_path / name), test)

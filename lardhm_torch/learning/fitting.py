@@ -31,9 +31,9 @@ FeaturesOf = Callable[[slice], tuple[Tensor, Tensor]]
 class FitConfig:
     """Training settings of the weights.
 
-    The settings of the paper, one pass over the weights at a constant learning rate without
-    preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False, preconditioner=False,
-    batch_size=1, adapt_shapes=False)``; the log-loss is then higher (see docs and benchmarks).
+    The defaults train to convergence. The settings of the paper, one pass at a constant learning rate
+    without preconditioner, are ``FitConfig(passes=1, learning_rate=0.1, decay=False,
+    preconditioner=False, batch_size=1)``; the log-loss is then higher (see docs and benchmarks).
     """
 
     passes: int | None = None  # passes over all points; None: 4, or more to reach `MIN_STEPS` steps

@@ -26,9 +26,7 @@ HIT = 0.1  # sum of the features of hits above which a cluster was hit
 NARROWEST = 0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones
 EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
 CONFIRMS = 2.0  # covariance scale of kernels for hits if rays are known: hits beside do not confirm
-POINT = (
-    2 / 3
-)  # a free point at the center of a cluster, compared with a scan that passed through it
+POINT = 2 / 3  # a free point at the center of a cluster, compared with a scan through it
 DOUBT = 3.0  # doubt at which a cluster is contradicted
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
 URGENT = 1000  # clusters whose trust changed are trained before others
@@ -63,8 +61,8 @@ def doubted(
     wide = kernel._replace(min_lengthscale=max(kernel.min_lengthscale, _narrowest(known)))
     shapes = (known.centers, known.raw_scale_tril, known.is_occupied)
     if passed is None:
-        hit = feature_sums(hits, *shapes, wide, index)
-        more = POINT * feature_sums(free, *shapes, wide, index)
+        hit, near = (feature_sums(part, *shapes, wide, index) for part in (hits, free))
+        more = POINT * near
     else:
         hit = feature_sums(hits, *shapes, wide._replace(covariance_scale=CONFIRMS), index)
         more = torch.zeros_like(hit).index_fill_(0, passed, 1)

@@ -117,14 +117,7 @@ def updated(
     points, labels = _thinned(points, labels, config, rng)
     points, labels = _still_unknown(part, points, labels, kernel, index)
     before = part.doubts
-    if rays is None:
-        part = replace(part, doubts=doubted(part, points, labels, kernel, index))
-    else:
-        passed, places = passed_clusters(part, rays)
-        part = replace(part, doubts=doubted(part, points, labels, kernel, index, passed))
-        part = still_unknown(part, rays, kernel.min_lengthscale)
-        gone = points_where(places, trust(part.doubts)[passed] < 1)
-        points, labels = torch.cat([points, gone]), torch.cat([labels, labels.new_zeros(len(gone))])
+    part, points, labels = _contradicted(part, points, labels, rays, kernel, index)
     part, classes = forget(part, before), tuple(split_labels(points, labels))
     total = int(state.counts[state.is_occupied].sum())
     occupied, grows = _most_occupied(part, classes[0], num_clusters, total), num_clusters is None
@@ -184,6 +177,25 @@ def _still_unknown(
     known = (probability - UNKNOWN).abs() >= UNDECIDED
     kept = torch.ones_like(labels, dtype=torch.bool).index_fill_(0, rows[known], False)
     return points_where(points, kept), labels[kept]
+
+
+def _contradicted(
+    part: MapState,
+    points: Tensor,
+    labels: Tensor,
+    rays: Lines | None,
+    kernel: Kernel,
+    index: Tensor,
+) -> tuple[MapState, Tensor, Tensor]:
+    """Clusters with new doubts, and the samples with free points where rays pass doubted clusters."""
+    if rays is None:
+        part = replace(part, doubts=doubted(part, points, labels, kernel, index))
+        return part, points, labels
+    passed, places = passed_clusters(part, rays)
+    part = replace(part, doubts=doubted(part, points, labels, kernel, index, passed))
+    gone = points_where(places, trust(part.doubts)[passed] < 1)
+    labels = torch.cat([labels, labels.new_zeros(len(gone))])
+    return still_unknown(part, rays, kernel.min_lengthscale), torch.cat([points, gone]), labels
 
 
 def _most_occupied(part: MapState, hits: Tensor, num_clusters: int | None, total: int) -> int:

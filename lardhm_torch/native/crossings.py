@@ -196,8 +196,8 @@ def passages_through(
 ) -> tuple[Tensor, Passages]:
     """Where rays pass through the cores of clusters: (P,) clusters and places; see `passages`.
 
-    The core of a cluster is within one standard deviation. A cluster that is not flat is also passed by
-    rays that start and end on one side of it.
+    The core of a cluster is within `CORE` standard deviations. A cluster that is not flat is also passed
+    by rays that start and end on one side of it.
 
     Args:
         means: (M, D) [m].

@@ -22,11 +22,8 @@ from lardhm_torch.surfaces.marching import Faces, march_blocks
 
 BATCH_BLOCKS = 1024  # examined at a time
 REGION_EDGE = 10.0  # [m] within which the surface is followed before other tiles are loaded
-FRONT, BEHIND, BEYOND = (
-    (1.0, 2.0),
-    (1.0, 2.0, 3.0),
-    (4.0, 6.0, 8.0),
-)  # [std] from a vertex, where tested
+FRONT = (1.0, 2.0)  # [standard deviations] from a vertex, where it is tested: in front of it, ...
+BEHIND, BEYOND = (-1.0, -2.0, -3.0), (-4.0, -6.0, -8.0)  # ... behind it, and beyond the surface
 FREE_FACTOR = 3.0  # on the margin in front, where free space can leak through walls
 FREER = 2.0  # times as far below the level as beyond the surface: so much suffices in front, too
 LEAST_SHARE = 0.01  # of a lattice edge between its end and a vertex of a closed surface
@@ -264,9 +261,9 @@ class _Follower:
             factors = torch.tensor(distances, dtype=torch.float64, device=points.device)
             return self.model.log_odds(points[rows] + factors[:, None, None] * steps[rows])
 
-        rows = rows[log_odds(tuple(-distance for distance in BEHIND)).amax(dim=0) > rule.highest]
+        rows = rows[log_odds(BEHIND).amax(dim=0) > rule.highest]
         in_front = log_odds(FRONT).amin(dim=0) - rule.free
-        beyond = log_odds(tuple(-distance for distance in BEYOND)).amin(dim=0) - rule.free
+        beyond = log_odds(BEYOND).amin(dim=0) - rule.free
         is_free = in_front < -FREE_FACTOR * rule.log_odds_margin
         return rows[is_free | (in_front < FREER * beyond.clamp(max=0))]
 
