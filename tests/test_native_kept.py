@@ -179,7 +179,7 @@ def test_opcheck_accepts_the_operators_of_kept_points(ops):
     torch.library.opcheck(ops.add_points.default, (found, cleared, points, owners.int()))
     torch.library.opcheck(ops.halves.default, (found,))
     indices, values = torch.zeros(4, 2, dtype=torch.int32), torch.ones(4, 2)
-    torch.library.opcheck(ops.excess_losses.default, (indices, values, values[:, 0], values[0], 2))
+    torch.library.opcheck(ops.errors.default, (indices, values, values[:, 0], values[0], 2, True))
 
 
 @dims

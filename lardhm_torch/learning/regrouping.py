@@ -134,7 +134,7 @@ def _divide(known: MapState, rule: Rule) -> Groups:
         own = (kinds == kind).nonzero().squeeze(1)
         room = max(factor * occupied, len(own)) - len(own)
         found = own[large[own]]
-        gain = losses[found] * _inertia(known.rows(found), kept_counts(known.evidence)[found])
+        gain = losses[found] * _inertia(light.rows(found), kept[found])
         found = found[gain.argsort(descending=True, stable=True)[:room]]
         if kind == 0 and rule.grows and len(own):
             occupied = len(own) + len(found)

@@ -57,7 +57,7 @@ def retrained(
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
     points, owners = kept_points(state.evidence, rows)
-    sizes = torch.bincount(owners, minlength=len(state))
+    sizes = torch.zeros_like(kept).index_copy_(0, rows, kept[rows])
     strength = evidence_weights(state, kept)
     factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
@@ -133,7 +133,7 @@ def excess_losses(
         stride: 1 for all samples.
     """
     if native.descends(indices, values):
-        return torch.ops.lardhm.excess_losses(indices, values, labels, weights, stride)
+        return torch.ops.lardhm.errors(indices, values, labels, weights, stride, True)
     indices, values, labels = (tensor[::stride] for tensor in (indices, values, labels))
     log_odds = (values * weights[indices]).sum(dim=1)
     loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, labels, reduction="none")
