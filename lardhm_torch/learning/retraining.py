@@ -167,7 +167,11 @@ def _stalest(state: MapState, kept: Tensor, limit: int) -> Tensor:
 
 def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
     """(M,) mask of clusters -> (M,) mask of the neighbors of their centers."""
-    near = native.nearest_centers(centers[mask], centers, num_neighbors, index)
+    points = centers[mask]
+    if native.supports(points):
+        given = (points.detach(), centers.detach(), num_neighbors, index)
+        return torch.ops.lardhm.neighbors_of(*given)
+    near = native.nearest_centers(points, centers, num_neighbors, index)
     return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
 
 

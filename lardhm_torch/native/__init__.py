@@ -333,6 +333,10 @@ def _register() -> None:
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.bool)
 
+    @library.register_fake("lardhm::neighbors_of")
+    def _(points: Tensor, centers: Tensor, *_: Any) -> Tensor:
+        return centers.new_empty(centers.shape[0], dtype=torch.bool)
+
     @library.register_fake("lardhm::balanced_order")
     def _(points: Tensor, levels: int) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.long)

@@ -210,8 +210,10 @@ bool write_errors(const Rows<T>& rows, int64_t n, int64_t stride, int64_t count,
   run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
     alignas(64) T at[kTogether] = {};
     const int64_t stop = std::min(n, (task + 1) * kGrain);
-    for (int64_t i = task * kGrain; i < stop; ++i)
+    for (int64_t i = task * kGrain; i < stop; ++i) {
+      __builtin_prefetch(rows.values + i * stride * rows.k);
       if (!all_below(count, rows.indices + i * stride * rows.k, rows.k)) valid = false;
+    }
     for (int64_t first = task * kGrain; first < stop && valid; first += kTogether) {
       const int together = int(std::min<int64_t>(kTogether, stop - first));
       log_odds_of<T, 0>(rows, first * stride, stride, together, weights, at);
