@@ -30,6 +30,9 @@ SLOW = 1e-30  # components of directions that are smaller count as this
 CHUNK_RAYS = 1 << 14  # number of rays that are followed at a time, in plain torch
 
 
+Spectra = tuple[Tensor, Tensor]  # of matrices: eigenvalues, ascending, and axes as columns
+
+
 class Lines(NamedTuple):
     """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
 
@@ -115,22 +118,15 @@ def find_patches(hits: Tensor) -> Patches:
 
 
 def patches_of(
-    means: Tensor,
-    covariances: Tensor,
-    floor: float = FLOOR,
-    spectra: tuple[Tensor, Tensor] | None = None,
+    means: Tensor, covariances: Tensor, floor: float = FLOOR, spectra: Spectra | None = None
 ) -> Patches:
-    """Patches with (L, D) means [m] and (L, D, D) covariances [m^2], to which ``floor``^2 is added.
-
-    ``spectra`` are the eigenvalues and axes of the covariances, if they are known.
-    """
+    """Patches with (L, D) means [m] and (L, D, D) covariances [m^2], to which ``floor``^2 is added."""
     found, axes = native.symmetric_axes(covariances) if spectra is None else spectra
-    eye = torch.eye(means.shape[1], dtype=means.dtype, device=means.device)
     variances = found.clamp(min=0) + floor**2
     spread = variances.sqrt()
     precisions = (axes / variances[:, None]) @ axes.mT
     is_flat = spread[:, 0] < FLAT * spread[:, 1]
-    covariances = covariances + floor**2 * eye
+    covariances = covariances + floor**2 * torch.eye(means.shape[1]).to(means)
     return Patches(means, covariances, precisions, axes[:, :, 0], spread[:, 0], is_flat)
 
 
