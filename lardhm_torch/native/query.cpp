@@ -1,5 +1,9 @@
 // Queries: the index, the k nearest centers, their kernel values, log-odds and probability.
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
@@ -189,6 +193,18 @@ std::vector<int32_t> places_of(const Tensor& order, int64_t n) {
   return place;
 }
 
+// Asks for large pages where an array will be written in no order: fewer faults, and fewer misses when
+// addresses are translated. It is a hint; systems without it ignore it.
+inline void prefer_large_pages([[maybe_unused]] const Tensor& array) {
+#if defined(__linux__)
+  constexpr uintptr_t kLarge = uintptr_t(1) << 21;
+  const uintptr_t begin = reinterpret_cast<uintptr_t>(array.mutable_data_ptr());
+  const uintptr_t end = begin + uintptr_t(array.numel()) * 4;
+  const uintptr_t first = (begin + kLarge - 1) / kLarge * kLarge, last = end / kLarge * kLarge;
+  if (first < last) madvise(reinterpret_cast<void*>(first), last - first, MADV_HUGEPAGE);
+#endif
+}
+
 // Neighbors and kernel values of all points, row by row or, if `ordered`, those of the points in the
 // order given, each point's own unsorted.
 Tensors<2> features_in_order(const Tensor& given_points, const Tensor& given_order,
@@ -205,6 +221,8 @@ Tensors<2> features_in_order(const Tensor& given_points, const Tensor& given_ord
   const Tensor rows = new_empty(points, {n, k}, ScalarType::Int);
   const Tensor values = new_empty(points, {n, k});
   if (k == 0) return {rows, values};
+  prefer_large_pages(rows);
+  prefer_large_pages(values);
   std::vector<int32_t> places;
   if (ordered) places = places_of(tidy(given_order), n);
   dispatch(centers, [&](auto type, auto dim) {
