@@ -35,8 +35,7 @@ def retrained(
 ) -> MapState:
     """Train the weights of changed clusters and their neighbors on evidence; other weights are fixed.
 
-    A cluster has changed if more than `FRESH` of its kept points are new. Half of the usual number of
-    neighbors are trained with it: the features of the others are small near it.
+    A cluster has changed if more than `FRESH` of its kept points are new.
 
     The evidence of the neighbors of those constrains them, too. ``losses`` of the trained clusters are
     updated.
@@ -53,8 +52,7 @@ def retrained(
     if not bool(changed.any()):
         return state
     index = native.build_index(state.centers, kernel.num_neighbors)
-    half = -(-kernel.num_neighbors // 2)
-    moving = changed | _neighbors(changed, state.centers, half, index)
+    moving = changed | _neighbors(changed, state.centers, kernel.num_neighbors, index)
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
