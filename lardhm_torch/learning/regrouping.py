@@ -42,6 +42,7 @@ JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others
 MORE = 1.25  # clusters relative to the number up to which they are divided: above, small ones go
 LEAST = 1 / 32  # of the mean inertia: clusters below it are dissolved if another one is close
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
+NEW = 0.5  # fraction of new points above which a cluster is divided because of its inertia alone
 MANY = 1.0  # new points relative to the kept ones, above which a cluster's points are regrouped
 NEW_ITERATIONS = 5  # of k-means for new clusters
 PER_OCCUPIED = (1, 2, 1)  # as in `fit`: n occupied clusters, 2 n free and n unknown ones
@@ -101,7 +102,10 @@ def regrouped(
     Returns:
         The K clusters followed by new ones; clusters without points have been dissolved.
     """
-    groups = _divide(known, rule)
+    kept = kept_counts(known.evidence)
+    losses = known.losses * trust(known.doubts)
+    gain = torch.where(losses > rule.split_loss, losses * _inertia(known, kept), 0)
+    groups = _divide(known, kept, gain, rule)
     before = len(groups.kinds)
     groups, owners = _joined(groups, classes, rule, rng)
     points, joined = torch.cat(classes), torch.cat(owners)
@@ -119,23 +123,31 @@ def regrouped(
     ]
     homes = joined[enters].split([len(part) for part in entering])
     moving = (entering, homes, received - again)
-    return _reassigned(groups._replace(state=state), moving, alive, len(known), rule.floor)
+    state = _reassigned(groups._replace(state=state), moving, alive, len(known), rule.floor)
+    kept = kept_counts(state.evidence)  # losses in new places are not known yet
+    gain = torch.where(state.fresh > NEW * kept, _inertia(state, kept), 0)
+    groups = _divide(state, kept, gain, rule)
+    return replace(groups.state, evidence=groups.evidence)
 
 
-def _divide(known: MapState, rule: Rule) -> Groups:
-    """Divide clusters of large loss in two; the second halves are appended."""
+def _divide(known: MapState, kept: Tensor, gain: Tensor, rule: Rule) -> Groups:
+    """Divide clusters in two, those of largest gain first; the second halves are appended.
+
+    Args:
+        known: K clusters.
+        kept: (K,) number of their points.
+        gain: (K,) 0 for clusters that are not divided.
+        rule: limits.
+    """
     kinds, light = known.kinds, replace(known, evidence=known.evidence[:, :0])
     divided = torch.zeros_like(known.is_occupied)
-    losses = known.losses * trust(known.doubts)
-    kept = kept_counts(known.evidence)
-    large = (losses > rule.split_loss) & (kept >= SPLIT)
+    large = (gain > 0) & (kept >= SPLIT)
     rows, occupied = [], rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
-        own = (kinds == kind).nonzero().squeeze(1)
+        own = ((kinds == kind) & (kept > 0)).nonzero().squeeze(1)
         room = max(factor * occupied, len(own)) - len(own)
         found = own[large[own]]
-        gain = losses[found] * _inertia(light.rows(found), kept[found])
-        found = found[gain.argsort(descending=True, stable=True)[:room]]
+        found = found[gain[found].argsort(descending=True, stable=True)[:room]]
         if kind == 0 and rule.grows and len(own):
             occupied = len(own) + len(found)
         rows.append(found)
