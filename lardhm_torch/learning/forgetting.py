@@ -2,9 +2,11 @@
 
 For each occupied cluster, the scans with rays that pass through it since its last hit are counted, or
 the free points near its center if the rays are not known. ``doubts`` is that count relative to a third of
-the binary logarithm of the number of its hits. Above `DOUBT`, the kept points have less weight in
-training, so a removed obstacle disappears after a few scans, a little later if it was observed for long.
-A hit restores the weight. Points of unknown clusters are removed if the map predicts them as free or
+the binary logarithm of the number of its hits. It exceeds `DOUBT` only together with that of most
+clusters around: an obstacle is removed as a whole, while at the edges of one that is still there some
+clusters are passed and others are hit. Above `DOUBT`, the kept points have less weight in training, so a
+removed obstacle disappears after a few scans, a little later if it was observed for long. A hit restores
+the weight. Points of unknown clusters are removed if the map predicts them as free or
 occupied.
 """
 
@@ -15,6 +17,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import feature_sums
 from lardhm_torch.learning.clustering import split_labels
@@ -28,6 +31,9 @@ EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
 CONFIRMS = 2.0  # covariance scale of kernels for hits if rays are known: hits beside do not confirm
 POINT = 2 / 3  # a free point at the center of a cluster, compared with a scan through it
 DOUBT = 3.0  # doubt at which a cluster is contradicted
+AROUND = 8  # so many occupied clusters, the cluster itself included, are asked whether ...
+MOST = 0.6  # ... this fraction of them is in doubt, too,
+REACH = 4.0  # ... if they are not further away than so many standard deviations along a surface
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
 URGENT = 1000  # clusters whose trust changed are trained before others
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
@@ -68,7 +74,23 @@ def doubted(
         more = torch.zeros_like(hit).index_fill_(0, passed, 1)
     tolerance = (4 + known.counts).log2().to(more) / 3
     doubts = torch.where(hit > HIT, 0, known.doubts + DOUBT * more / tolerance)
-    return doubts * known.is_occupied
+    return _shared(known, doubts * known.is_occupied)
+
+
+def _shared(known: MapState, doubts: Tensor) -> Tensor:
+    """(M,) doubts, limited to `DOUBT` where most occupied clusters around are not in doubt."""
+    rows = (doubts > DOUBT).nonzero().squeeze(1)
+    if len(rows) == 0:
+        return doubts
+    occupied = known.is_occupied.nonzero().squeeze(1)
+    centers, others = known.centers[rows], known.centers[occupied]
+    near = native.nearest_centers(centers, others, min(AROUND, len(others))).long()
+    variances = known.clusters.covariances[rows].diagonal(dim1=1, dim2=2).sum(dim=1)
+    reach = REACH * (variances / max(1, centers.shape[1] - 1)).sqrt()
+    around = (others[near] - centers[:, None]).norm(dim=2) <= reach[:, None]
+    in_doubt = around & (doubts[occupied[near]] >= DOUBT)
+    agree = in_doubt.sum(dim=1) >= MOST * around.sum(dim=1)
+    return doubts.index_copy(0, rows, torch.where(agree, doubts[rows], DOUBT))
 
 
 def _narrowest(known: MapState) -> float:
