@@ -40,7 +40,7 @@ from lardhm_torch.learning.points import in_morton_order
 
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 MORE = 1.25  # clusters relative to the number up to which they are divided: above, small ones go
-LEAST = 1 / 64  # of the mean inertia: clusters below it are dissolved if another one is close
+LEAST = 1 / 32  # of the mean inertia: clusters below it are dissolved if another one is close
 SMALL = 1 / 8  # of it: clusters below it are not divided, and they make room for the ...
 LARGE = 3.0  # ... division of clusters above so many times the mean inertia
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
