@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-
 from small_maps import wall
 
 from lardhm_torch import LardHilbertMap, Scans, StreamConfig, UpdateConfig
