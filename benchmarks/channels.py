@@ -161,7 +161,7 @@ def room(seed: int) -> dict[str, Any]:
             stream.calibrate_classes(own.ends, own.channels["class"], wrong_labels=WRONG)
         samples = sample_rays(scan, seed=number)
         given = samples.points, samples.labels
-        stream.update(*given, seed=number, channels=samples.channels)
+        stream.update(*given, seed=number, channels=samples.channels, rays=scan)
     rows = {
         f"vote of {NEIGHBORS} nearest hits": class_scores(votes, true),
         "map, before calibration": class_scores(uncalibrated, true),

@@ -218,9 +218,10 @@ def update(data: Path) -> None:
     scans = load_scans(data / "stream_balm" / "scans.npz")
     model, times = LardHilbertMap(), []
     for scan in range(40):
-        samples = sample_rays(scans.select(scans.scan_id == scan))
+        rays = scans.select(scans.scan_id == scan)
+        samples = sample_rays(rays)
         start = time.process_time()
-        model.update(samples.points, samples.labels)
+        model.update(samples.points, samples.labels, rays=rays)
         middle = time.process_time()
         surface_faces(model)
         times.append((middle - start, time.process_time() - middle))

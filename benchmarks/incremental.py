@@ -110,7 +110,8 @@ def revisits(arguments: argparse.Namespace) -> list[Row]:
             sizes, model = [], LardHilbertMap()
             for seed, visit in enumerate(visits):
                 samples = sample_rays(visit, seed=seed)
-                model.update(samples.points, samples.labels, seed=seed, config=config)
+                given = (samples.points, samples.labels)
+                model.update(*given, seed=seed, rays=visit, config=config)
                 sizes.append(len(model))
             row = {"set": name, "rule": rule, "rays a visit": len(visits[0]), "first": sizes[0]}
             rows.append(

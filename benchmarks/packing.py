@@ -122,8 +122,9 @@ def stream_rows(path: Path, folder: Path, frames: int) -> list[Row]:
     rows: list[Row] = []
     for number in range(min(frames, scans.num_scans)):
         rays = protocol_rays(scans.select(scans.scan_id == number), 2 * FRAME_RAYS, seed=number)
-        samples = sample_rays(split_rays(rays, 0.5, seed=number)[0], seed=number)
-        model.update(samples.points, samples.labels, seed=number)
+        train, _ = split_rays(rays, 0.5, seed=number)
+        samples = sample_rays(train, seed=number)
+        model.update(samples.points, samples.labels, seed=number, rays=train)
         receiver.apply(packet := sender.packet(model))
         sizes.append(len(packet))
         model.pack(folder / "map.lhm")

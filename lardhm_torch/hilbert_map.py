@@ -4,39 +4,30 @@ from __future__ import annotations
 
 import copy
 import os
-from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from lardhm_torch.channels import CLASS, Channels, check_channels
+from lardhm_torch.channels import Channels, check_channels
 from lardhm_torch.io import map_files
-from lardhm_torch.learning import (
-    aging,
-    channel_sums,
-    class_training,
-    map_merging,
-    packing,
-    parameters,
-    posterior,
-)
+from lardhm_torch.learning import aging, channel_sums, map_merging, packing, parameters, posterior
 from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.clearing import ray_lines
 from lardhm_torch.learning.clustering import check_num_clusters
 from lardhm_torch.learning.fitting import FitConfig, FitTask
-from lardhm_torch.learning.passing import lines_of
+from lardhm_torch.learning.passing import check_rays, lines_of
 from lardhm_torch.learning.points import training_points
 from lardhm_torch.learning.scene_clusters import fit_scene
 from lardhm_torch.learning.sized_maps import SMALL, fit_size
 from lardhm_torch.learning.state_dicts import file_state
 from lardhm_torch.learning.update import Task, UpdateConfig, updated
-from lardhm_torch.map_queries import MapQueries
+from lardhm_torch.map_classes import MapClasses
 from lardhm_torch.maps import TensorLike
 from lardhm_torch.scans import Scans, seeded_generator
 
 
-class LardHilbertMap(MapQueries):
+class LardHilbertMap(MapClasses):
     """Continuous occupancy map whose log-odds are a weighted sum of local kernel features.
 
     The log-odds are the logit of the probability of occupancy. The probability is exactly 1/2 in an
@@ -140,100 +131,6 @@ class LardHilbertMap(MapQueries):
 
     @changes_map
     @torch.no_grad()
-    def fit_classes(
-        self,
-        points: TensorLike,
-        classes: TensorLike,
-        num_clusters: int | None = None,
-        *,
-        seed: int = 0,
-        wrong_labels: float = 0.0,
-        config: FitConfig | None = None,
-    ) -> LardHilbertMap:
-        """Train ``class_weights`` on labeled points with the multinomial log-loss.
-
-        An empty map becomes a multi-class Hilbert map without occupancy: the points of each class are
-        clustered separately, in any dimension and unit, and the probability of occupancy stays 1/2. A
-        fitted map without classes first gets the class counts of the points. Occupancy and clusters
-        of a fitted map do not change. If anything fails, the map is unchanged.
-
-        Args:
-            points: (N, D) world positions.
-            classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
-            num_clusters: number of clusters of an empty map; None: one per 30 points of a class.
-            seed: random seed of clustering and training.
-            wrong_labels: fraction of the labels that are those of a random other class. The map then
-                predicts the true class instead of the label.
-            config: training settings.
-
-        Returns:
-            This map.
-
-        Raises:
-            ValueError: wrong shapes, NaN or infinite points, no point has a class, a class number,
-                probability or wrong_labels is out of range, or the map is packed.
-        """
-        self.check_learns()
-        check_num_clusters(num_clusters)
-        class_training.check_wrong_labels(wrong_labels)
-        rng = seeded_generator(seed, "fit_classes", self.centers.device)
-        labelled = class_training.check_class_points(points, classes, self.centers)
-        if len(self) == 0:
-            found = class_training.clustered(labelled, num_clusters, self.kernel, self.centers, rng)
-        else:
-            state, origin = parameters.read_state(self), self.origin
-            found = class_training.with_classes(state, origin, self.channel_layout, labelled)
-        state, origin, layout = found
-        draft = copy.deepcopy(self)
-        parameters.write_state(draft, class_training.untrained(state), origin, layout)
-        local = draft._to_map_frame(labelled.points)
-        base = draft.class_log_odds(labelled.points)
-        targets = class_training.class_targets(labelled.classes, layout[CLASS], base.dtype)
-        samples = class_training.ClassSamples(*draft._nearest_features(local), base, targets)
-        weights = class_training.initial_weights(state, len(layout[CLASS]))
-        weights = class_training.train_class_weights(
-            samples, weights, config or FitConfig(), rng, wrong_labels
-        )
-        state = replace(state, class_weights=weights)
-        if len(self) == 0:
-            parameters.write_state(self, state, origin, layout)
-        else:
-            map_merging.replace_clusters(self, state, origin, slice(None), layout)
-        return self
-
-    @changes_map
-    @torch.no_grad()
-    def calibrate_classes(
-        self, points: TensorLike, classes: TensorLike, *, wrong_labels: float = 0.0
-    ) -> LardHilbertMap:
-        """Fit ``class_scale``, the factor on the class log-odds, to labels by maximum likelihood.
-
-        The class counts of a cluster give the distribution of its labels, which is underconfident about
-        the true class if a few labels are wrong. The factor does not change which class is most likely.
-        Use points on which the map was not trained, such as those of the next scan before it is added.
-
-        Args:
-            points: (N, D) world positions on surfaces [m].
-            classes: (N,) class numbers, -1 where missing, or (N, K) probabilities, NaN where missing.
-            wrong_labels: fraction of the labels that are those of a random other class.
-
-        Returns:
-            This map.
-
-        Raises:
-            ValueError: the map has no classes or is packed, or see `fit_classes`.
-        """
-        self.check_learns()
-        class_training.check_wrong_labels(wrong_labels)
-        labelled = class_training.check_class_points(points, classes, self.centers)
-        labelled = class_training.of_known_classes(labelled, self.classes)
-        targets = class_training.class_targets(labelled.classes, self.classes, self.weights.dtype)
-        log_odds = self.class_log_odds(labelled.points) / self.class_scale
-        self.class_scale = class_training.best_scale(log_odds, targets, wrong_labels)
-        return self
-
-    @changes_map
-    @torch.no_grad()
     def fit_uncertainty(self, points: TensorLike, labels: TensorLike) -> LardHilbertMap:
         """Estimate the variance of the weights, for `variance` and `bayesian_probability`.
 
@@ -287,7 +184,8 @@ class LardHilbertMap(MapQueries):
             seed: random seed of clustering and training.
             channels: see `fit`; channels and classes that are new to the map are added to it.
             time: time stamp of the scan [s]; required if the map has a ``max_age``.
-            rays: the scan of the points; obstacles that its rays pass through disappear sooner.
+            rays: the scan of the points; obstacles that its rays pass through disappear sooner. An
+                empty map has no obstacles, and Algorithm 2 of the paper does not use rays.
             config: settings; `UpdateConfig(as_in_paper=True)` selects Algorithm 2 of the paper.
 
         Returns:
@@ -300,6 +198,7 @@ class LardHilbertMap(MapQueries):
         """
         self.check_learns()
         aging.check_time(time, self.max_age)
+        check_rays(rays, self.dim)
         if len(points) == 0 and len(labels) == 0:
             return self
         if len(self) == 0:

@@ -8,9 +8,9 @@ from sklearn.linear_model import LogisticRegression
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, kernel_factors, nearest_features
 from lardhm_torch.learning import fitting
+from lardhm_torch.learning.class_balance import balance_classes
 from lardhm_torch.learning.fitting import (
     FitConfig,
-    balance_classes,
     batch_gradient,
     fit_weights,
     logistic_loss,

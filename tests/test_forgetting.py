@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from small_maps import wall, wall_map
 
@@ -11,7 +12,7 @@ from lardhm_torch import (
     native,
 )
 from lardhm_torch.learning import parameters
-from lardhm_torch.learning.clustering import cluster_points
+from lardhm_torch.learning.clustering import Clusters, cluster_points
 from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
 from lardhm_torch.learning.forgetting import (
     DOUBT,
@@ -136,7 +137,9 @@ def test_only_occupied_clusters_that_rays_pass_and_none_hits_are_contradicted():
     kernel = LardHilbertMap().kernel
     hits, free = wall(seed=1, at=9.0)[0][:600], wall(seed=2)[0][:600]
     both, labels = torch.cat([hits, free]), torch.tensor([1.0, 0.0]).repeat_interleave(600)
-    passed = forgetting_state(known, both, labels, kernel)
+    passed = known
+    for _ in range(4):
+        passed = forgetting_state(passed, both, labels, kernel)
     assert torch.equal(trust(passed.doubts) < 1, known.is_occupied)
     hit_again = forgetting_state(passed, free, torch.ones(600), kernel)
     assert (trust(hit_again.doubts) == 1).all()
@@ -156,6 +159,48 @@ def test_scans_with_rays_through_a_cluster_count_until_it_is_hit():
     hit = doubted(known, known.means[1:2], torch.ones(1), kernel, index, passed)
     assert hit[1] == 0
     torch.testing.assert_close(hit[3], 2 * once[3])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_clusters_are_contradicted_only_together_with_most_around_them(dim):
+    """What hides single clusters shows them again; a removed obstacle is passed everywhere."""
+    along = torch.arange(10.0, dtype=F64) - 4.5
+    patch = torch.cartesian_prod(along, along) if dim == 3 else along[:, None]
+    centers = 0.1 * torch.nn.functional.pad(patch, (1, 0))
+    centers = torch.cat([centers, torch.full((1, dim), 7.0, dtype=F64)])  # one stands alone
+    scatter = 49 * torch.diag(torch.tensor([1e-4] + [8.3e-4] * (dim - 1), dtype=F64))
+    clusters = Clusters(
+        torch.full((len(centers),), 50), centers, scatter.expand(len(centers), dim, dim)
+    )
+    known = new_rows(clusters, torch.ones(len(centers), dtype=torch.bool), 0.01)
+    kernel = LardHilbertMap(dim=dim).kernel
+    index = native.build_index(known.centers, kernel.num_neighbors)
+    nothing = (centers[:1] + 50, torch.zeros(1), kernel, index)
+
+    def after_scans(passed):
+        state = known
+        for _ in range(20):
+            state = replace(state, doubts=doubted(state, *nothing, passed))
+        return trust(state.doubts) < 1
+
+    everything = torch.arange(len(centers))
+    assert after_scans(everything).all()
+    middle, border = centers[:-1].norm(dim=1).argmin(), centers[:-1].norm(dim=1).argmax()
+    assert not after_scans(torch.stack([middle, border])).any()
+    half = (centers[:-1, 1] > 0).nonzero().squeeze(1)
+    gone = after_scans(half)
+    assert gone[half][centers[half, 1] > 0.1].all()
+    assert gone.sum() <= len(half)
+    assert after_scans(everything[-1:]).sum() == 1
+
+
+def test_many_free_points_of_one_scan_count_as_one_scan():
+    known, kernel = known_wall(), LardHilbertMap().kernel
+    index = native.build_index(known.centers, kernel.num_neighbors)
+    free = known.means.repeat_interleave(20, dim=0)
+    doubts = doubted(known, free, torch.zeros(len(free)), kernel, index)
+    once = 3 * DOUBT / (4 + known.counts.double()).log2()
+    torch.testing.assert_close(doubts, once)
 
 
 def forgetting_state(known, points, labels, kernel):

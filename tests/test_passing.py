@@ -4,16 +4,19 @@ import math
 
 import pytest
 import torch
+from command_runs import run
 from torch import Tensor
 
 from lardhm_torch import (
     LardHilbertMap,
     Scans,
     StreamConfig,
+    UpdateConfig,
     clearance,
     native,
     real_time,
     sample_rays,
+    save_scans,
     stream_scans,
 )
 from lardhm_torch.learning import passing
@@ -21,6 +24,7 @@ from lardhm_torch.learning.evidence import kept_counts, kept_points
 from lardhm_torch.learning.parameters import read_state
 from lardhm_torch.native import crossings
 from lardhm_torch.native.crossings import passages_through
+from lardhm_torch.scans import concatenate_scans
 
 F64 = torch.float64
 
@@ -233,9 +237,46 @@ def test_rays_through_a_flat_cluster_count_if_they_are_steep():
     assert len(nothing[0]) == 0
 
 
-def test_rays_are_checked():
-    scan, _ = box_scan(True, 0)
-    samples = sample_rays(scan)
-    model = LardHilbertMap().fit(samples.points, samples.labels)
-    with pytest.raises(ValueError, match="3 dimensions"):
-        model.update(samples.points, samples.labels, rays=person_scan(True, 0)[0])
+PAPER = UpdateConfig(as_in_paper=True)
+
+
+@pytest.mark.parametrize("config", [None, PAPER])
+@pytest.mark.parametrize("is_empty", [False, True])
+def test_rays_of_another_dimension_are_refused(is_empty, config):
+    samples = sample_rays(box_scan(True, 0)[0])
+    model, rays = LardHilbertMap(), person_scan(True, 0)[0]
+    if not is_empty:
+        model.fit(samples.points, samples.labels)
+    before = len(model)
+    for points, labels in ((samples.points, samples.labels), ([], [])):
+        with pytest.raises(ValueError, match="rays must have the 3 dimensions of the map; got 2"):
+            model.update(points, labels, rays=rays, config=config)
+    assert len(model) == before
+
+
+def test_the_first_scan_and_algorithm_2_do_not_depend_on_rays():
+    samples = [sample_rays(box_scan(True, seed)[0]) for seed in range(2)]
+    away = box_scan(False, 2)[0]  # passes through the box
+    fitted = LardHilbertMap().fit(samples[0].points, samples[0].labels)
+    started = LardHilbertMap().update(samples[0].points, samples[0].labels, rays=away)
+    assert torch.equal(started(samples[1].points), fitted(samples[1].points))
+    given = (samples[1].points, samples[1].labels)
+    fitted.update(*given, config=PAPER)
+    started.update(*given, config=PAPER, rays=away)
+    assert torch.equal(started(samples[1].points), fitted(samples[1].points))
+
+
+@pytest.mark.parametrize("verb", ["fit --incremental", "fit, update"])
+def test_a_person_that_left_is_gone_after_three_scans_on_the_command_line(verb, tmp_path):
+    scans, on_it = zip(*(person_scan(n < 6, n) for n in range(9)), strict=True)
+    for name, part in (("before", scans[:6]), ("after", scans[6:])):
+        save_scans(concatenate_scans(list(part)), tmp_path / f"{name}.npz")
+    hits = torch.cat([scan.ends[rows] for scan, rows in zip(scans, on_it, strict=True)])
+    before, after, path = (tmp_path / name for name in ("before.npz", "after.npz", "map.pt"))
+    if verb == "fit --incremental":
+        run("fit", before, after, "-o", path, "--incremental")
+    else:
+        run("fit", before, "-o", path)
+        assert (LardHilbertMap.load(path)(hits) > 0.5).double().mean() > 0.8
+        run("update", path, after, "-o", path)
+    assert (LardHilbertMap.load(path)(hits) > 0.5).double().mean() < 0.02

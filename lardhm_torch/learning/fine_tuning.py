@@ -13,8 +13,8 @@ from tqdm import tqdm
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.changes import changes_map
+from lardhm_torch.learning.class_balance import balance_classes
 from lardhm_torch.learning.fitting import (
-    balance_classes,
     logistic_loss,
     stratified_batches,
 )

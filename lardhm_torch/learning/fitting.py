@@ -14,6 +14,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.bridging import bridged
+from lardhm_torch.learning.class_balance import balance_classes
 from lardhm_torch.learning.clustering import ITERATIONS_OF, ROUGH_ITERATIONS, group_classes
 from lardhm_torch.learning.evidence import fitted_evidence
 from lardhm_torch.learning.map_state import MapState, new_rows
@@ -187,51 +188,6 @@ def stratified_batches(
     place += torch.arange(count, device=rng.device) // batches
     # Sequential reads with scattered writes are several times faster than a gather.
     return tuple(torch.empty_like(column).index_copy_(0, place, column) for column in columns)
-
-
-def class_factors(free: Tensor, occupied: Tensor, occupied_share: float = 0.5) -> Tensor:
-    """(2,) loss factors of a free and an occupied point that balance the classes.
-
-    The mean over all points is 1. If only one class is present, both factors are 1.
-
-    Args:
-        free: () number, or total weight, of the free points.
-        occupied: () number, or total weight, of the occupied points.
-        occupied_share: class weight of the occupied points, as a fraction of the loss.
-    """
-    total = free + occupied
-    balanced = total * torch.stack([(1 - occupied_share) / free, occupied_share / occupied])
-    return torch.where((occupied > 0) & (free > 0), balanced, torch.ones_like(balanced))
-
-
-def label_factors(
-    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
-) -> Tensor:
-    """(N,) labels -> (3,) loss factors of a free, an unknown and an occupied point, float64.
-
-    The first and last are those of `class_factors`. The total weight of the unknown points is
-    ``unknown_share`` times that of all others.
-    """
-    occupied, unknown = (labels > 0.5).sum(), (labels == 0.5).sum()
-    counts = torch.stack([len(labels) - unknown - occupied, unknown, occupied])
-    return count_factors(counts, occupied_share, unknown_share)
-
-
-def count_factors(
-    counts: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
-) -> Tensor:
-    """(3,) numbers of free, unknown and occupied points -> their `label_factors`."""
-    free, unknown, occupied = counts.double().unbind()
-    known = free + occupied
-    factor, hit = class_factors(free, occupied, occupied_share).unbind()
-    return torch.stack([factor, unknown_share * known / unknown.clamp(min=1), hit])
-
-
-def balance_classes(
-    labels: Tensor, occupied_share: float = 0.5, unknown_share: float = 0.25
-) -> Tensor:
-    """(N,) labels -> (N,) loss factors, see `label_factors`."""
-    return label_factors(labels, occupied_share, unknown_share).to(labels)[(2 * labels).long()]
 
 
 def loss_factors(labels: Tensor, config: FitConfig) -> Tensor:

@@ -1,13 +1,12 @@
 """Forgetting: kept points that a new scan contradicts.
 
 For each occupied cluster, the scans with rays that pass through it since its last hit are counted, or
-the free points near its center if the rays are not known. ``doubts`` is that count relative to a third of
-the binary logarithm of the number of its hits. It exceeds `DOUBT` only together with that of most
-clusters around: an obstacle is removed as a whole, while at the edges of one that is still there some
-clusters are passed and others are hit. Above `DOUBT`, the kept points have less weight in training, so a
-removed obstacle disappears after a few scans, a little later if it was observed for long. A hit restores
-the weight. Points of unknown clusters are removed if the map predicts them as free or
-occupied.
+those with free points near its center if the rays are not known. ``doubts`` is that count relative to a
+third of the binary logarithm of the number of its hits. It exceeds `DOUBT` only together with that of
+most clusters around: an obstacle is removed as a whole, while at the edges of one that is still there
+some clusters are passed and others are hit. Above `DOUBT`, the kept points have less weight in training,
+so a removed obstacle disappears after a few scans, a little later if it was observed for long. A hit
+restores the weight. Points of unknown clusters are removed if the map predicts them as free or occupied.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ HIT = 0.1  # sum of the features of hits above which a cluster was hit
 NARROWEST = 0.03  # [m] smallest standard deviation of kernels here: few points pass thinner ones
 EXTENT = 0.25  # ... and at most this fraction of the clusters' usual size
 CONFIRMS = 2.0  # covariance scale of kernels for hits if rays are known: hits beside do not confirm
-POINT = 2 / 3  # a free point at the center of a cluster, compared with a scan through it
 DOUBT = 3.0  # doubt at which a cluster is contradicted
 AROUND = 8  # so many occupied clusters, the cluster itself included, are asked whether ...
 MOST = 0.6  # ... this fraction of them is in doubt, too,
@@ -49,9 +47,9 @@ def doubted(
 ) -> Tensor:
     """(M,) evidence against each occupied cluster since its last hit.
 
-    A scan with rays that passed through it counts 1. If the rays are not known, each free point counts
-    `POINT` times its feature, which is 1 at the center of a cluster and falls to 0. `DOUBT` is reached
-    when the count is a third of the binary logarithm of 4 plus the cluster's hits.
+    A scan with rays that passed through it counts 1. If the rays are not known, it counts the sum of the
+    features of its free points, which are 1 at the center of the cluster and fall to 0, but at most 1.
+    `DOUBT` is reached when the count is a third of the binary logarithm of 4 plus the cluster's hits.
 
     Args:
         known: M clusters.
@@ -68,7 +66,7 @@ def doubted(
     shapes = (known.centers, known.raw_scale_tril, known.is_occupied)
     if passed is None:
         hit, near = (feature_sums(part, *shapes, wide, index) for part in (hits, free))
-        more = POINT * near
+        more = near.clamp(max=1)
     else:
         hit = feature_sums(hits, *shapes, wide._replace(covariance_scale=CONFIRMS), index)
         more = torch.zeros_like(hit).index_fill_(0, passed, 1)

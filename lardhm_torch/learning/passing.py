@@ -27,6 +27,12 @@ from lardhm_torch.scans import Scans
 FEW_RAYS = 4096  # of many rays, fewer than twice as many are compared with unknown points
 
 
+def check_rays(scans: Scans | None, dim: int) -> None:
+    """Raise a ValueError if there are rays, and they do not have the dimension of the map."""
+    if scans is not None and scans.dim != dim:
+        raise ValueError(f"rays must have the {dim} dimensions of the map; got {scans.dim}")
+
+
 def lines_of(scans: Scans | None, origin: Tensor) -> Lines | None:
     """The rays of scans in the frame of a map, as far as they were seen to go.
 
@@ -37,10 +43,9 @@ def lines_of(scans: Scans | None, origin: Tensor) -> Lines | None:
     Raises:
         ValueError: the scans do not have the dimension of the map.
     """
+    check_rays(scans, len(origin))
     if scans is None:
         return None
-    if scans.dim != len(origin):
-        raise ValueError(f"rays must have the {len(origin)} dimensions of the map; got {scans.dim}")
     limits = SamplingConfig()
     rays = (usable_rays(scans, limits)[0] & (scans.target_index == 1)).nonzero().squeeze(1)
     starts, ends = (part[rays].to(origin) for part in (scans.ray_origins, scans.ends))

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lardhm_torch.learning.fitting import balance_classes
+from lardhm_torch.learning.class_balance import balance_classes
 
 FeaturesAt = Callable[[Tensor], tuple[Tensor, Tensor]]
 

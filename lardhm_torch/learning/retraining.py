@@ -10,12 +10,12 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
+from lardhm_torch.learning.class_balance import count_factors
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.evidence import kept_counts, kept_points
 from lardhm_torch.learning.fitting import (
     FitConfig,
     FitTask,
-    count_factors,
     fit_weights,
     stratified_batches,
 )

@@ -15,6 +15,7 @@ from functools import partial
 from torch import Tensor
 
 from lardhm_torch import native
+from lardhm_torch.learning.class_balance import balance_classes
 from lardhm_torch.learning.clearing import cleared
 from lardhm_torch.learning.clustering import (
     POINTS_PER_CLUSTER,
@@ -25,7 +26,6 @@ from lardhm_torch.learning.fitting import (
     CHUNK_ROWS,
     Batched,
     FitTask,
-    balance_classes,
     fit_clusters,
     logistic_loss,
 )

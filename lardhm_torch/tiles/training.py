@@ -22,6 +22,7 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel, raw_factors
 from lardhm_torch.learning.assignment import ordered_features
+from lardhm_torch.learning.class_balance import class_factors
 from lardhm_torch.learning.clustering import (
     MIN_COUNT,
     POINTS_PER_CLUSTER,
@@ -29,7 +30,7 @@ from lardhm_torch.learning.clustering import (
     cluster_each,
     concatenate_clusters,
 )
-from lardhm_torch.learning.fitting import FitConfig, class_factors, fit_weights, stratified_batches
+from lardhm_torch.learning.fitting import FitConfig, fit_weights, stratified_batches
 from lardhm_torch.learning.map_state import factor_covariances
 from lardhm_torch.learning.points import blurred_hits, in_morton_order
 from lardhm_torch.tiles.indexing import Index

@@ -113,7 +113,7 @@ def figure_four(data: Path, folder: Path) -> dict[str, Any]:
 
 
 def figure_five(data: Path, folder: Path) -> dict[str, Any]:
-    """The visual-SLAM-like set, keyframe after keyframe, each bringing 100 clusters (Algorithm 2)."""
+    """The visual-SLAM-like set, keyframe after keyframe, each adding at most 100 clusters."""
     rays = rays_of(data, "sevenscenes_semidense")
     model, seconds, sizes = LardHilbertMap(), [], []
     for scan in tqdm(range(rays.num_scans), "Fig. 5", file=sys.stderr):

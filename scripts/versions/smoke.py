@@ -34,7 +34,7 @@ def main(with_kernel: bool) -> None:
     samples = lh.sample_rays(train, seed=0)
     model = lh.LardHilbertMap().fit(samples.points, samples.labels, num_clusters=150, seed=0)
     lh.fine_tune(model, samples.points, samples.labels, config=lh.TuneConfig(epochs=1))
-    model.update(samples.points[::5], samples.labels[::5], seed=0)
+    model.update(samples.points[::5], samples.labels[::5], seed=0, rays=train)
     accuracy = lh.evaluate(model, test)["unif"]["balanced_accuracy"]
     check(accuracy > 0.9, f"balanced accuracy is {accuracy:.3f}, above 0.9")
     points = samples.points[:500]
