@@ -9,7 +9,7 @@ from lardhm_torch.learning import evidence
 from lardhm_torch.learning.assignment import feature_sums
 from lardhm_torch.learning.evidence import EVIDENCE, keep_points
 from lardhm_torch.learning.points import count_cells
-from lardhm_torch.learning.retraining import excess_losses
+from lardhm_torch.learning.retraining import _neighbors, excess_losses
 
 CLUSTERS = 40
 KERNEL = kernel(8)
@@ -178,8 +178,33 @@ def test_opcheck_accepts_the_operators_of_kept_points(ops):
     cleared = torch.arange(CLUSTERS) % 2 == 0
     torch.library.opcheck(ops.add_points.default, (found, cleared, points, owners.int()))
     torch.library.opcheck(ops.halves.default, (found,))
+    index = native.build_index(points, 3)
+    torch.library.opcheck(ops.neighbors_of.default, (points[:5], points, 3, index))
     indices, values = torch.zeros(4, 2, dtype=torch.int32), torch.ones(4, 2)
-    torch.library.opcheck(ops.excess_losses.default, (indices, values, values[:, 0], values[0], 2))
+    torch.library.opcheck(ops.errors.default, (indices, values, values[:, 0], values[0], 2, True))
+
+
+def test_losses_reject_clusters_that_do_not_exist(ops):
+    indices, values = torch.zeros(300, 2, dtype=torch.int32), torch.ones(300, 2)
+    indices[299, 1] = 7
+    given = (values[:, 0], torch.zeros(7))
+    assert len(excess_losses(indices, values, *given, 2)) == 150  # that row is not used
+    for wrong in (7, -1):
+        indices[299, 1] = wrong
+        with pytest.raises(RuntimeError, match="index out of range"):
+            excess_losses(indices, values, *given)
+
+
+@dims
+@dtypes
+def test_neighbors_of_some_clusters(both, dtype, dim):
+    centers = make_map(900, dim, dtype)[0]
+    mask = torch.arange(900) % 90 == 4
+    index = native.build_index(centers, 8)
+    fast, plain = both(_neighbors, mask, centers, 8, index)
+    assert torch.equal(fast, plain)
+    assert 10 <= int(fast.sum()) <= 80
+    assert int(_neighbors(mask & ~mask, centers, 8, index).sum()) == 0
 
 
 @dims

@@ -123,7 +123,7 @@ def test_misfits_are_those_of_plain_torch(ops, monkeypatch, dtype):
 
 def test_opcheck_accepts_the_operators(ops):
     indices, values = torch.zeros(4, 2, dtype=torch.int32), torch.ones(4, 2)
-    torch.library.opcheck(ops.misfits.default, (indices, values, values[:, 0], values[0]))
+    torch.library.opcheck(ops.errors.default, (indices, values, values[:, 0], values[0], 1, False))
     torch.library.opcheck(ops.in_cells_around.default, (values, values, 0.1))
     table = torch.zeros(3, 6)
     torch.library.opcheck(

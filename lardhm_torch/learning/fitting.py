@@ -182,11 +182,12 @@ def stratified_batches(
     rounds = -(-count // batches)
     first = torch.randint(batches, (rounds, 1), generator=rng, device=rng.device)
     turn = torch.randperm(batches, generator=rng, device=rng.device)
-    batch = turn[(torch.arange(batches, device=rng.device) + first) % batches].reshape(-1)[:count]
-    sizes = torch.bincount(batch, minlength=batches)
-    place = (sizes.cumsum(0) - sizes)[batch]
-    place += torch.arange(count, device=rng.device) // batches
+    batch = torch.cat([turn, turn])[torch.arange(batches, device=rng.device) + first]  # (rounds, B)
+    last = batch.reshape(-1)[count // batches * batches : count]
+    sizes = count // batches + torch.bincount(last, minlength=batches)
+    place = (sizes.cumsum(0) - sizes)[batch] + torch.arange(rounds, device=rng.device)[:, None]
     # Sequential reads with scattered writes are several times faster than a gather.
+    place = place.reshape(-1)[:count]
     return tuple(torch.empty_like(column).index_copy_(0, place, column) for column in columns)
 
 

@@ -63,9 +63,9 @@ def retrained(
     strength = evidence_weights(state, kept)
     factors = balanced(state.kinds, strength, config, kept) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
-    surfaces = _surfaces(state, rows)
-    factors = _settled(points, labels, factors[owners], surfaces, kernel.min_lengthscale)
-    represented = float(strength.index_select(0, owners).sum())
+    factors, surfaces = factors.index_select(0, owners), _surfaces(state, rows)
+    factors = _settled(points, labels, factors, surfaces, kernel.min_lengthscale)
+    represented = float((strength * kept).index_select(0, rows).sum())
     config = replace(config, l2=config.l2 * len(points) / represented)
     config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
@@ -154,7 +154,7 @@ def excess_losses(
         stride: 1 for all samples.
     """
     if native.descends(indices, values):
-        return torch.ops.lardhm.excess_losses(indices, values, labels, weights, stride)
+        return torch.ops.lardhm.errors(indices, values, labels, weights, stride, True)
     indices, values, labels = (tensor[::stride] for tensor in (indices, values, labels))
     log_odds = (values * weights[indices]).sum(dim=1)
     loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, labels, reduction="none")
@@ -188,7 +188,11 @@ def _stalest(state: MapState, kept: Tensor, limit: int) -> Tensor:
 
 def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:
     """(M,) mask of clusters -> (M,) mask of the neighbors of their centers."""
-    near = native.nearest_centers(centers[mask], centers, num_neighbors, index)
+    points = centers[mask]
+    if native.supports(points):
+        given = (points.detach(), centers.detach(), num_neighbors, index)
+        return torch.ops.lardhm.neighbors_of(*given)
+    near = native.nearest_centers(points, centers, num_neighbors, index)
     return torch.zeros_like(mask).index_fill_(0, near.reshape(-1), True)
 
 

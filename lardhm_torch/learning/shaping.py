@@ -131,5 +131,5 @@ def misfits(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) ->
         weights: (M,).
     """
     if native.descends(indices, values):
-        return torch.ops.lardhm.misfits(indices, values, labels, weights)
+        return torch.ops.lardhm.errors(indices, values, labels, weights, 1, False)
     return (torch.sigmoid((values * weights[indices]).sum(dim=1)) - labels).abs()

@@ -333,6 +333,10 @@ def _register() -> None:
     def _(points: Tensor, *_: Any) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.bool)
 
+    @library.register_fake("lardhm::neighbors_of")
+    def _(points: Tensor, centers: Tensor, *_: Any) -> Tensor:
+        return centers.new_empty(centers.shape[0], dtype=torch.bool)
+
     @library.register_fake("lardhm::balanced_order")
     def _(points: Tensor, levels: int) -> Tensor:
         return points.new_empty(points.shape[0], dtype=torch.long)
@@ -360,13 +364,10 @@ def _register() -> None:
     def _(evidence: Tensor) -> tuple[Tensor, Tensor]:
         return torch.empty_like(evidence), torch.empty_like(evidence)
 
-    @library.register_fake("lardhm::excess_losses")
-    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor, stride: int) -> Tensor:
+    @library.register_fake("lardhm::errors")
+    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor, stride: int,
+          losses: bool) -> Tensor:  # fmt: skip
         return labels.new_empty(-(-labels.shape[0] // stride))
-
-    @library.register_fake("lardhm::misfits")
-    def _(indices: Tensor, values: Tensor, labels: Tensor, weights: Tensor) -> Tensor:
-        return torch.empty_like(labels)
 
     @library.register_fake("lardhm::tuning_steps")
     def _(points: Tensor, indices: Tensor, labels: Tensor, factors: Tensor, start: Tensor,

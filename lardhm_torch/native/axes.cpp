@@ -11,19 +11,26 @@
 namespace lardhm {
 namespace {
 
+constexpr int kMatrices = 8;  // at a time
+
 template <class T, int D>
 void find_axes(const T* matrices, int64_t count, T* values, T* axes) {
-  constexpr int64_t kRows = 512;
+  constexpr int64_t kRows = 64 * kMatrices;
   run_tasks((count + kRows - 1) / kRows, [&](int64_t task) {
     const int64_t end = std::min(count, (task + 1) * kRows);
-    for (int64_t row = task * kRows; row < end; ++row) {
-      double matrix[D * D], found[D], columns[D][D];
-      for (int i = 0; i < D * D; ++i) matrix[i] = double(matrices[row * D * D + i]);
-      jacobi<D>(matrix, found, columns);
-      for (int i = 0; i < D; ++i) {
-        values[row * D + i] = T(found[i]);
-        for (int j = 0; j < D; ++j) axes[(row * D + i) * D + j] = T(columns[i][j]);
-      }
+    for (int64_t first = task * kRows; first < end; first += kMatrices) {
+      const int64_t members = std::min<int64_t>(kMatrices, end - first);
+      Matrices<D, kMatrices> matrix = {}, columns;
+      double found[D][kMatrices];
+      for (int64_t m = 0; m < members; ++m)
+        for (int i = 0; i < D * D; ++i)
+          matrix[i / D][i % D][m] = double(matrices[(first + m) * D * D + i]);
+      jacobi<D, kMatrices>(matrix, found, columns);
+      for (int64_t m = 0; m < members; ++m)
+        for (int i = 0; i < D; ++i) {
+          values[(first + m) * D + i] = T(found[i][m]);
+          for (int j = 0; j < D; ++j) axes[((first + m) * D + i) * D + j] = T(columns[i][j][m]);
+        }
     }
   });
 }

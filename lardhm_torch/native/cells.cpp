@@ -28,9 +28,12 @@ class Bits {
  public:
   explicit Bits(int bits) : words(size_t(1) << (bits - 5)), last((uint32_t(1) << bits) - 1) {}
 
-  bool has(uint32_t entry) const {
-    return words[(entry & last) >> 5].load(std::memory_order_relaxed) >> (entry & 31) & 1;
+  // The 32 bits of which an entry has number `entry % 32`.
+  uint32_t word(uint32_t entry) const {
+    return words[(entry & last) >> 5].load(std::memory_order_relaxed);
   }
+
+  bool has(uint32_t entry) const { return word(entry) >> (entry & 31) & 1; }
 
   void mark(uint32_t entry) {
     if (!has(entry))
@@ -85,12 +88,12 @@ void march(const int64_t* cell, const float* inside, const float* way, int64_t s
       entry ^= (whole_cells(at) + uint32_t(cell[d])) * kPrimes[d];
     }
     entry &= kEntries;
-    uint32_t entries[kWide];
+    uint32_t entries[kWide], words[kWide];
     std::memcpy(entries, &entry, sizeof(entries));
-    const int64_t count = steps - step;
-    uint32_t some = 0;
-    for (int j = 0; j < kWide; ++j) some |= uint32_t(table.glance.has(entries[j])) << j;
-    for (some &= existing(0, count); some; some &= some - 1)
+    for (int j = 0; j < kWide; ++j) words[j] = table.glance.word(entries[j]);
+    const Unsigned bit = load<Unsigned>(words) >> (entry & 31) & 1;
+    const uint32_t some_set = ~bits_le<WideInt>((WideInt)bit, WideInt{});
+    for (uint32_t some = some_set & existing(0, steps - step); some; some &= some - 1)
       table.cross(entries[__builtin_ctz(some)]);
   }
 }

@@ -30,6 +30,9 @@ SLOW = 1e-30  # components of directions that are smaller count as this
 CHUNK_RAYS = 1 << 14  # number of rays that are followed at a time, in plain torch
 
 
+Spectra = tuple[Tensor, Tensor]  # of matrices: eigenvalues, ascending, and axes as columns
+
+
 class Lines(NamedTuple):
     """What rays saw: (R, D) or (1, D) starts [m], (R, D) directions, (R,) how far [m]."""
 
@@ -114,15 +117,16 @@ def find_patches(hits: Tensor) -> Patches:
     return patches_of(means, scatters / (sizes - 1).clamp(min=1)[:, None, None])
 
 
-def patches_of(means: Tensor, covariances: Tensor, floor: float = FLOOR) -> Patches:
+def patches_of(
+    means: Tensor, covariances: Tensor, floor: float = FLOOR, spectra: Spectra | None = None
+) -> Patches:
     """Patches with (L, D) means [m] and (L, D, D) covariances [m^2], to which ``floor``^2 is added."""
-    eye = torch.eye(means.shape[1], dtype=means.dtype, device=means.device)
-    covariances = covariances + floor**2 * eye
-    variances, axes = native.symmetric_axes(covariances)
-    variances = variances.clamp(min=floor**2)
+    found, axes = native.symmetric_axes(covariances) if spectra is None else spectra
+    variances = found.clamp(min=0) + floor**2
     spread = variances.sqrt()
     precisions = (axes / variances[:, None]) @ axes.mT
     is_flat = spread[:, 0] < FLAT * spread[:, 1]
+    covariances = covariances + floor**2 * torch.eye(means.shape[1]).to(means)
     return Patches(means, covariances, precisions, axes[:, :, 0], spread[:, 0], is_flat)
 
 
@@ -213,9 +217,10 @@ def passages_through(
     bounds = torch.arange((1 << levels) + 1, device=means.device) * len(means) >> levels
     order = balanced_order(means, levels)[bounds[:-1]]  # a leaf without a cluster gets the next one
     means, covariances = means[order], covariances[order]
-    patches = patches_of(means, covariances)
+    spectra = native.symmetric_axes(covariances)
+    patches = patches_of(means, covariances, FLOOR, spectra)
     clear = torch.where(patches.is_flat, NEAR * patches.thickness + margin, -torch.inf)
-    thin = patches_of(means, covariances, THIN)
+    thin = patches_of(means, covariances, THIN, spectra)
     cores = patches._replace(precisions=thin.precisions, covariances=thin.covariances)
     rays, leaves = crossed(cores, lines, ends, clear, CORE)
     depths = _closest(rays, leaves, lines, cores)[0]

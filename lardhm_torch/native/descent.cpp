@@ -3,6 +3,7 @@
 // The same arithmetic as `fitting.batch_gradient` and `fitting.descend`, without temporary arrays.
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -51,21 +52,25 @@ __attribute__((always_inline)) inline void for_indices(const int32_t* index, int
 
 constexpr int kTogether = 64;
 
-// Probabilities of some rows together, so that no row waits for its own sigmoid.
+// Log-odds of `count` rows, every `stride`-th from the first one.
 template <class T, int K>
-inline void predict(const Rows<T>& rows, int64_t first, int count, const T* __restrict weights,
-                    T* __restrict at) {
-  constexpr int W = Simd<T>::W;
-  using V = typename Simd<T>::V;
+inline void log_odds_of(const Rows<T>& rows, int64_t first, int64_t stride, int count,
+                        const T* __restrict weights, T* __restrict at) {
   const int64_t k = K > 0 ? K : rows.k;
   for (int i = 0; i < count; ++i) {
-    const T* value = rows.values + (first + i) * k;
+    const T* value = rows.values + (first + i * stride) * k;
     T sum = 0;
-    for_indices<K>(rows.indices + (first + i) * k, k,
+    for_indices<K>(rows.indices + (first + i * stride) * k, k,
                    [&](int64_t j, uint32_t index) { sum += value[j] * weights[index]; });
     at[i] = sum;
   }
-  for (int i = 0; i < kTogether; i += W) {
+}
+
+// Probabilities from log-odds, together, so that no row waits for its own sigmoid.
+template <class T>
+inline void to_probabilities(T* at) {
+  using V = typename Simd<T>::V;
+  for (int i = 0; i < kTogether; i += Simd<T>::W) {
     const V probability = sigmoid<T>(load<V>(at + i));
     std::memcpy(at + i, &probability, sizeof(probability));
   }
@@ -79,7 +84,8 @@ void add_gradient(const Rows<T>& rows, int64_t begin, int64_t end, const T* __re
   alignas(64) T at[kTogether] = {};
   for (int64_t first = begin; first < end; first += kTogether) {
     const int count = int(std::min<int64_t>(kTogether, end - first));
-    predict<T, K>(rows, first, count, weights, at);
+    log_odds_of<T, K>(rows, first, 1, count, weights, at);
+    to_probabilities(at);
     for (int i = 0; i < count; ++i) {
       const int64_t row = first + i;
       const T* value = rows.values + row * k;
@@ -127,6 +133,13 @@ void descend(const Rates& rates, int64_t step, int64_t rows, int64_t count, T* _
 
 using State = Tensors<3>;
 
+bool all_below(int64_t count, const int32_t* index, int64_t size) {
+  uint32_t largest = 0;
+  for (int64_t i = 0; i < size; ++i) largest = std::max(largest, uint32_t(index[i]));
+  return size == 0 || int64_t(largest) < count;
+}
+
+// Indices are checked batch by batch, while they are in the cache.
 template <class T>
 void run_batches(const Rows<T>& rows, int64_t n, int64_t count, const State& state,
                  const Rates& rates) {
@@ -136,6 +149,8 @@ void run_batches(const Rows<T>& rows, int64_t n, int64_t count, const State& sta
   int64_t step = rates.first_step;
   for (int64_t begin = 0; begin < n; begin += rates.batch_size, ++step) {
     const int64_t end = std::min(n, begin + rates.batch_size);
+    check(all_below(count, rows.indices + begin * rows.k, (end - begin) * rows.k),
+          "index out of range");
     add_gradient_for<T>(rows, begin, end, weights, slope.data());
     descend<T>(rates, step, end - begin, count, slope.data(), weights, mean, square);
   }
@@ -152,11 +167,8 @@ void check_descent(const Tensor& indices, const Tensor& values, const Tensor& la
   for (const Tensor* t : {&state[0], &state[1], &state[2]})
     fits = fits && t->numel() == count && t->scalar_type() == dtype;
   check(fits, "features, labels, factors and state must agree in size and dtype");
-  const int32_t* index = in<int32_t>(indices);
-  const int64_t entries = indices.numel();
-  uint32_t largest = 0;
-  for (int64_t i = 0; i < entries; ++i) largest = std::max(largest, uint32_t(index[i]));
-  check(entries == 0 || int64_t(largest) < count, "index out of range");
+  check(dtype == ScalarType::Double || dtype == ScalarType::Float,
+        "values must be float32 or float64");
 }
 
 State descent(const Tensor& given_indices, const Tensor& given_values, const Tensor& given_labels,
@@ -177,68 +189,59 @@ State descent(const Tensor& given_indices, const Tensor& given_values, const Ten
     const Rows<T> rows{in<int32_t>(indices), in<T>(values), in<T>(labels), in<T>(factors), k};
     run_batches<T>(rows, n, count, state, rates);
   };
-  const bool wide = values.scalar_type() == ScalarType::Double;
-  check(wide || values.scalar_type() == ScalarType::Float,
-        "values must be float32 or float64");
-  wide ? run(double{}) : run(float{});
+  values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});
   return state;
 }
 
-// Loss of every so many-th row in excess of that of a perfect prediction.
-Tensor excess_losses(const Tensor& given_indices, const Tensor& given_values,
-                     const Tensor& given_labels, const Tensor& given_weights, int64_t stride) {
+// Loss in excess of that of a perfect prediction.
+template <class T>
+T excess_loss(T log_odds, T label) {
+  const T other = 1 - label, size = std::abs(log_odds);
+  const T loss = std::max(log_odds, T(0)) - log_odds * label + std::log1p(std::exp(-size));
+  return label > 0 && other > 0 ? loss + label * std::log(label) + other * std::log(other) : loss;
+}
+
+// Errors of every `stride`-th of the rows: excess losses, or how far probabilities are from labels.
+template <class T>
+bool write_errors(const Rows<T>& rows, int64_t n, int64_t stride, int64_t count, const T* weights,
+                  bool losses, T* to) {
+  constexpr int64_t kGrain = 32 * kTogether;
+  std::atomic<bool> valid{true};
+  run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
+    alignas(64) T at[kTogether] = {};
+    const int64_t stop = std::min(n, (task + 1) * kGrain);
+    for (int64_t i = task * kGrain; i < stop; ++i) {
+      __builtin_prefetch(rows.values + i * stride * rows.k);
+      if (!all_below(count, rows.indices + i * stride * rows.k, rows.k)) valid = false;
+    }
+    for (int64_t first = task * kGrain; first < stop && valid; first += kTogether) {
+      const int together = int(std::min<int64_t>(kTogether, stop - first));
+      log_odds_of<T, 0>(rows, first * stride, stride, together, weights, at);
+      if (!losses) to_probabilities(at);
+      for (int i = 0; i < together; ++i) {
+        const T label = rows.labels[(first + i) * stride];
+        to[first + i] = losses ? excess_loss(at[i], label) : std::abs(at[i] - label);
+      }
+    }
+  });
+  return valid;
+}
+
+Tensor errors(const Tensor& given_indices, const Tensor& given_values, const Tensor& given_labels,
+              const Tensor& given_weights, int64_t stride, bool losses) {
   const Tensor indices = tidy(given_indices), values = tidy(given_values);
   const Tensor labels = tidy(given_labels), weights = tidy(given_weights);
   check_descent(indices, values, labels, labels, {weights, weights, weights});
   check(stride >= 1, "stride must be 1 or more");
   const int64_t k = values.size(1), n = (values.size(0) + stride - 1) / stride;
-  const Tensor losses = new_empty(values, {n});
-  const auto run = [&](auto type) {
-    using T = decltype(type);
-    constexpr int64_t kGrain = 2048;
-    run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
-      const int64_t end = std::min(n, (task + 1) * kGrain);
-      for (int64_t i = task * kGrain; i < end; ++i) {
-        const int64_t row = i * stride;
-        const int32_t* index = in<int32_t>(indices) + row * k;
-        const T* value = in<T>(values) + row * k;
-        T sum = 0;
-        for (int64_t j = 0; j < k; ++j) sum += value[j] * in<T>(weights)[index[j]];
-        const T label = in<T>(labels)[row], other = 1 - label;
-        T loss = std::max(sum, T(0)) - sum * label + std::log1p(std::exp(-std::abs(sum)));
-        if (label > 0 && other > 0) loss += label * std::log(label) + other * std::log(other);
-        out<T>(losses)[i] = loss;
-      }
-    });
-  };
-  values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});
-  return losses;
-}
-
-// How far the probability of each row is from its label.
-Tensor misfits(const Tensor& given_indices, const Tensor& given_values, const Tensor& given_labels,
-               const Tensor& given_weights) {
-  const Tensor indices = tidy(given_indices), values = tidy(given_values);
-  const Tensor labels = tidy(given_labels), weights = tidy(given_weights);
-  check_descent(indices, values, labels, labels, {weights, weights, weights});
-  const int64_t n = values.size(0);
   const Tensor found = new_empty(values, {n});
   const auto run = [&](auto type) {
     using T = decltype(type);
-    constexpr int64_t kGrain = 64 * kTogether;
-    const Rows<T> rows{in<int32_t>(indices), in<T>(values), in<T>(labels), nullptr, values.size(1)};
-    run_tasks((n + kGrain - 1) / kGrain, [&](int64_t task) {
-      alignas(64) T at[kTogether] = {};
-      const int64_t end = std::min(n, (task + 1) * kGrain);
-      for (int64_t first = task * kGrain; first < end; first += kTogether) {
-        const int count = int(std::min<int64_t>(kTogether, end - first));
-        predict<T, 0>(rows, first, count, in<T>(weights), at);
-        for (int i = 0; i < count; ++i)
-          out<T>(found)[first + i] = std::abs(at[i] - rows.labels[first + i]);
-      }
-    });
+    const Rows<T> rows{in<int32_t>(indices), in<T>(values), in<T>(labels), nullptr, k};
+    return write_errors<T>(rows, n, stride, weights.numel(), in<T>(weights), losses, out<T>(found));
   };
-  values.scalar_type() == ScalarType::Double ? run(double{}) : run(float{});
+  const bool wide = values.scalar_type() == ScalarType::Double;
+  check(wide ? run(double{}) : run(float{}), "index out of range");
   return found;
 }
 
@@ -246,11 +249,9 @@ Tensor misfits(const Tensor& given_indices, const Tensor& given_values, const Te
 
 std::vector<Operator> descent_operators() {
   return {
-      {"misfits(Tensor indices, Tensor values, Tensor labels, Tensor weights) -> Tensor",
-       &boxed<misfits>},
-      {"excess_losses(Tensor indices, Tensor values, Tensor labels, Tensor weights, int stride) -> "
-       "Tensor",
-       &boxed<excess_losses>},
+      {"errors(Tensor indices, Tensor values, Tensor labels, Tensor weights, int stride, "
+       "bool losses) -> Tensor",
+       &boxed<errors>},
       {"descent(Tensor indices, Tensor values, Tensor labels, Tensor factors, Tensor weights, "
        "Tensor mean, Tensor square, int num_points, int batch_size, int first_step, "
        "int total_steps, float learning_rate, bool decay, bool preconditioner, float l1, float l2) "

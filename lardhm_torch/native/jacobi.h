@@ -8,47 +8,77 @@
 
 namespace lardhm {
 
-// Eigenvalues in ascending order, and axes as the columns of `axes`, each of length 1.
-template <int D>
-void jacobi(const double* matrix, double* values, double (&axes)[D][D]) {
-  constexpr int kSweeps = 12;
-  double a[D][D], size = 0;
+// D x D elements of L matrices, those of the matrices side by side, so that L lanes of a register turn
+// one matrix each.
+template <int D, int L>
+using Matrices = double[D][D][L];
+
+// Turns columns p and q of matrices, each by its own angle.
+template <int D, int L>
+inline void turn(const double* c, const double* s, int p, int q, Matrices<D, L>& a) {
   for (int i = 0; i < D; ++i)
-    for (int j = 0; j < D; ++j) {
-      a[i][j] = matrix[i * D + j];
-      axes[i][j] = i == j;
-      size += a[i][j] * a[i][j];
+    for (int m = 0; m < L; ++m) {
+      const double x = a[i][p][m], y = a[i][q][m];
+      a[i][p][m] = c[m] * x - s[m] * y, a[i][q][m] = s[m] * x + c[m] * y;
     }
-  for (int sweep = 0; sweep < kSweeps; ++sweep) {
-    double rest = 0;
-    for (int p = 0; p < D; ++p)
-      for (int q = p + 1; q < D; ++q) rest += a[p][q] * a[p][q];
-    if (!(rest > 1e-36 * size)) break;
-    for (int p = 0; p < D; ++p)
-      for (int q = p + 1; q < D; ++q) {
-        if (a[p][q] == 0) continue;
-        const double half = (a[q][q] - a[p][p]) / (2 * a[p][q]);
-        const double t = std::copysign(1 / (std::abs(half) + std::sqrt(half * half + 1)), half);
-        const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-        for (int i = 0; i < D; ++i) {
-          const double x = a[i][p], y = a[i][q];
-          a[i][p] = c * x - s * y, a[i][q] = s * x + c * y;
-        }
-        for (int i = 0; i < D; ++i) {
-          const double x = a[p][i], y = a[q][i];
-          a[p][i] = c * x - s * y, a[q][i] = s * x + c * y;
-          const double z = axes[i][p], w = axes[i][q];
-          axes[i][p] = c * z - s * w, axes[i][q] = s * z + c * w;
-        }
-      }
+}
+
+// One rotation of the matrices and of their axes, unless they are done, or are diagonal there.
+template <int D, int L>
+inline void rotate(int p, int q, const double* unfinished, Matrices<D, L>& a,
+                   Matrices<D, L>& axes) {
+  double c[L], s[L];
+  for (int m = 0; m < L; ++m) {
+    const double off = a[p][q][m];
+    const bool turns = off != 0 && unfinished[m] != 0;
+    const double half = (a[q][q][m] - a[p][p][m]) / (2 * (turns ? off : 1));
+    const double size = 1 / (std::abs(half) + std::sqrt(half * half + 1));
+    const double t = turns ? std::copysign(size, half) : 0;
+    c[m] = 1 / std::sqrt(t * t + 1), s[m] = t * c[m];
   }
-  for (int i = 0; i < D; ++i) values[i] = a[i][i];
+  turn<D, L>(c, s, p, q, a);
   for (int i = 0; i < D; ++i)
-    for (int j = i + 1; j < D; ++j)
-      if (values[j] < values[i]) {
-        std::swap(values[i], values[j]);
-        for (int row = 0; row < D; ++row) std::swap(axes[row][i], axes[row][j]);
+    for (int m = 0; m < L; ++m) {
+      const double x = a[p][i][m], y = a[q][i][m];
+      a[p][i][m] = c[m] * x - s[m] * y, a[q][i][m] = s[m] * x + c[m] * y;
+    }
+  turn<D, L>(c, s, p, q, axes);
+}
+
+// Of L matrices, which become diagonal: eigenvalues in ascending order, and axes as the columns of
+// `axes`, each of length 1.
+template <int D, int L>
+void jacobi(Matrices<D, L>& a, double (&values)[D][L], Matrices<D, L>& axes) {
+  constexpr int kSweeps = 12;
+  double size[L] = {}, unfinished[L];
+  for (int i = 0; i < D; ++i)
+    for (int j = 0; j < D; ++j)
+      for (int m = 0; m < L; ++m) {
+        axes[i][j][m] = i == j;
+        size[m] += a[i][j][m] * a[i][j][m];
       }
+  for (int sweep = 0; sweep < kSweeps; ++sweep) {
+    double rest[L] = {}, some = 0;
+    for (int p = 0; p < D; ++p)
+      for (int q = p + 1; q < D; ++q)
+        for (int m = 0; m < L; ++m) rest[m] += a[p][q][m] * a[p][q][m];
+    for (int m = 0; m < L; ++m) {
+      unfinished[m] = rest[m] > 1e-36 * size[m];
+      some += unfinished[m];
+    }
+    if (some == 0) break;
+    for (int p = 0; p < D; ++p)
+      for (int q = p + 1; q < D; ++q) rotate<D, L>(p, q, unfinished, a, axes);
+  }
+  for (int m = 0; m < L; ++m) {
+    for (int i = 0; i < D; ++i) values[i][m] = a[i][i][m];
+    for (int i = 0; i < D; ++i)
+      for (int j = i + 1; j < D; ++j)
+        if (values[j][m] < values[i][m]) {
+          std::swap(values[i][m], values[j][m]);
+          for (int row = 0; row < D; ++row) std::swap(axes[row][i][m], axes[row][j][m]);
+        }
+  }
 }
 
 }  // namespace lardhm

@@ -256,13 +256,15 @@ Tensors<4> follow_kept(
 // Direction of the largest eigenvalue of a symmetric matrix; its largest component is positive.
 template <int D>
 void longest_axis(const double* matrix, double* axis) {
-  double values[D], axes[D][D];
-  jacobi<D>(matrix, values, axes);
+  Matrices<D, 1> one, axes;
+  double values[D][1];
+  for (int i = 0; i < D * D; ++i) one[i / D][i % D][0] = matrix[i];
+  jacobi<D, 1>(one, values, axes);
   int largest = 0;
   for (int i = 1; i < D; ++i)
-    if (std::abs(axes[i][D - 1]) > std::abs(axes[largest][D - 1])) largest = i;
-  const double sign = axes[largest][D - 1] < 0 ? -1 : 1;
-  for (int i = 0; i < D; ++i) axis[i] = sign * axes[i][D - 1];
+    if (std::abs(axes[i][D - 1][0]) > std::abs(axes[largest][D - 1][0])) largest = i;
+  const double sign = axes[largest][D - 1][0] < 0 ? -1 : 1;
+  for (int i = 0; i < D; ++i) axis[i] = sign * axes[i][D - 1][0];
 }
 
 // The kept points of each cluster, divided at their mean along the longest axis.

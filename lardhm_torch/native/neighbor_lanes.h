@@ -23,43 +23,6 @@ struct Record {
   static constexpr int fields = weight + 1, stride = 16;  // stride: of gradients, too
 };
 
-// Lanes of a (0 .. W - 1) and b (W .. 2 W - 1), picked by number.
-template <class T>
-inline typename Simd<T>::V shuffle(typename Simd<T>::V a, typename Simd<T>::V b,
-                                   typename Simd<T>::I lanes) {
-#if defined(__GNUC__) && !defined(__clang__)
-  return __builtin_shuffle(a, b, lanes);
-#else
-  typename Simd<T>::V picked;
-  for (int i = 0; i < Simd<T>::W; ++i)
-    picked[i] = lanes[i] < Simd<T>::W ? a[lanes[i]] : b[lanes[i] - Simd<T>::W];
-  return picked;
-#endif
-}
-
-// Lane i of register j becomes lane j of register i, for W registers: in each stage, blocks of 1, 2, 4, ...
-// lanes change places.
-template <class T, int Stage = 1>
-inline void transpose(typename Simd<T>::V* v) {
-  using V = typename Simd<T>::V;
-  using I = typename Simd<T>::I;
-  constexpr int W = Simd<T>::W;
-  if constexpr (Stage < W) {
-    I first, second;
-    for (int lane = 0; lane < W; ++lane) {
-      first[lane] = lane & Stage ? W + lane - Stage : lane;
-      second[lane] = lane & Stage ? W + lane : lane + Stage;
-    }
-    for (int i = 0; i < W; ++i) {
-      if (i & Stage) continue;
-      const V a = v[i], b = v[i + Stage];
-      v[i] = shuffle<T>(a, b, first);
-      v[i + Stage] = shuffle<T>(a, b, second);
-    }
-    transpose<T, 2 * Stage>(v);
-  }
-}
-
 // Fields of a point's neighbors, then their gradients: a row of lanes each.
 template <class T, int D>
 struct Lanes {

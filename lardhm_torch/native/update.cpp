@@ -158,6 +158,51 @@ Tensor feature_sums(const Tensor& given_points, const Tensor& centers, const Ten
   return sums;
 }
 
+// Marks the neighbors of all points.
+template <class T, int D>
+struct MarkVisitor final : Visitor<T, D> {
+  const int32_t* order;
+  int64_t k;
+  bool* marked;  // by row; threads only ever write true
+
+  MarkVisitor(const Parameters<T, D>& parameters, int64_t k_, bool* marked_)
+      : order(parameters.index.order), k(k_), marked(marked_) {}
+
+  void mark(int64_t row) { __atomic_store_n(marked + row, true, __ATOMIC_RELAXED); }
+
+  void invalid(int64_t) override {
+    for (int64_t row = 0; row < k; ++row) mark(row);  // as `features.nearest_centers`
+  }
+
+  void packet(const Packet<T, D>&, const Selection& selected) override {
+    for (int64_t j = 0; j < selected.size; ++j) mark(order[selected.rank[j]]);
+  }
+};
+
+Tensor neighbors_of(const Tensor& given_points, const Tensor& given_centers, int64_t k,
+                    const Tensor& given_index) {
+  check_k(k);
+  const Tensor points = tidy(given_points), centers = tidy(given_centers);
+  const Tensor index = usable_index(given_index);
+  check_rows("points", points, centers);
+  const int64_t n = points.size(0), count = centers.size(0);
+  const Tensor marked = new_empty(centers, {count}, ScalarType::Bool);
+  std::fill_n(out<bool>(marked), count, false);
+  k = std::min(k, count);
+  if (n == 0 || k == 0) return marked;
+  dispatch(centers, [&](auto type, auto dim) {
+    using T = decltype(type);
+    constexpr int D = dim();
+    const CallIndex<T, D> call(in<char>(index), index.numel(), in<T>(centers), count);
+    Parameters<T, D> parameters(call.index, in<T>(centers), nullptr, nullptr, {},
+                                n >= count / kPointsOfFew);
+    MarkVisitor<T, D> visitor(parameters, k, out<bool>(marked));
+    visit_all<T, D>(in<T>(points), n, parameters, k, visitor);
+    return 0;
+  });
+  return marked;
+}
+
 // Whether a kernel's extent along every axis, `stds` standard deviations, meets the box.
 template <class T, int D>
 struct Extents {
@@ -221,6 +266,8 @@ std::vector<Operator> update_operators() {
       {"feature_sums(Tensor points, Tensor centers, Tensor raw_scale_tril, Tensor index, "
        "Tensor wanted, int k, float covariance_scale, float min_lengthscale) -> Tensor",
        &boxed<feature_sums>},
+      {"neighbors_of(Tensor points, Tensor centers, int k, Tensor index) -> Tensor",
+       &boxed<neighbors_of>},
       {"reaching(Tensor centers, Tensor raw_scale_tril, Tensor points, float stds, "
        "float covariance_scale, float min_lengthscale) -> Tensor",
        &boxed<reaching>},
