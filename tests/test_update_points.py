@@ -1,10 +1,16 @@
 """The points and the training of an update: how many new points it uses, their weights, its steps."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from small_maps import wall
 
-from lardhm_torch import Scans, StreamConfig, UpdateConfig
-from lardhm_torch.learning.retraining import _with_enough_steps, balanced
+from lardhm_torch import LardHilbertMap, Scans, StreamConfig, UpdateConfig
+from lardhm_torch.learning import parameters, retraining
+from lardhm_torch.learning.evidence import evidence_moments, keep_points
+from lardhm_torch.learning.map_state import new_rows
+from lardhm_torch.learning.retraining import _with_enough_steps, balanced, retrained
 from lardhm_torch.learning.update import UPDATE_FIT, _thinned
 from lardhm_torch.native.thinning import PER_CELL
 from lardhm_torch.scans import seeded_generator
@@ -75,3 +81,45 @@ def test_few_points_give_as_many_steps_as_needed(num_points):
     assert config.passes * batches >= 64
     assert config.passes == 2 or config.passes * batches < 64 + batches
     assert num_points < 100_000 or config.passes == 2
+
+
+def factors_of(state, fresh, monkeypatch):
+    """Points, labels and loss factors on which an update trains if some clusters are fresh."""
+    found = []
+    trained = retraining.trained
+    monkeypatch.setattr(
+        retraining, "trained", lambda *given: found.append(given[2]) or trained(*given)
+    )
+    state.fresh[:] = 100.0 * fresh
+    retrained(state, 10_000, LardHilbertMap().kernel, UPDATE_FIT, generator())
+    return found[0]
+
+
+def test_classes_are_balanced_however_many_clusters_are_trained(monkeypatch):
+    state = parameters.read_state(LardHilbertMap().fit(*wall(), num_clusters=400))
+    some = state.means[:, 1] < state.means[:, 1].quantile(0.2)
+    some &= ~state.is_occupied | (state.means[:, 2] < state.means[:, 2].median())  # fewer hits
+    points, _, factors = factors_of(state, torch.ones_like(some), monkeypatch)
+    of_all = dict(zip(map(tuple, points.tolist()), factors.tolist(), strict=True))
+    points, _, factors = factors_of(state, some, monkeypatch)
+    assert 0 < len(points) < 0.8 * len(of_all)
+    again = torch.tensor([of_all[tuple(point)] for point in points.tolist()]).to(factors)
+    torch.testing.assert_close(factors, again)
+
+
+def test_unknown_points_inside_surfaces_have_no_weight(monkeypatch):
+    """They were sampled behind a hit of one scan at grazing incidence."""
+    points, labels = wall()
+    model = LardHilbertMap().fit(points, labels, num_clusters=40)
+    hits = (points[labels > 0.5][::20] - model.origin).to(model.centers)
+    depth = torch.tensor([0.01, 0.4])
+    places = (hits + depth[:, None, None] * torch.eye(3)[0]).reshape(-1, 3)
+    evidence = keep_points(places, torch.arange(2).repeat_interleave(len(hits)), 2)
+    found = replace(evidence_moments(evidence), counts=torch.zeros(2, dtype=torch.long))
+    unknown = new_rows(found, torch.zeros(2, dtype=torch.bool), 0.02, evidence)
+    state = parameters.read_state(model)
+    state = state.put(torch.empty(0, dtype=torch.long), unknown)
+    points, labels, factors = factors_of(state, torch.ones_like(state.weights), monkeypatch)
+    unweighted = (labels == 0.5) & (points[:, 0] < hits[:, 0].mean() + 0.2)
+    assert int(unweighted.sum()) == int((labels == 0.5).sum()) / 2 > 0
+    assert torch.equal(factors == 0, unweighted)

@@ -41,6 +41,8 @@ from lardhm_torch.learning.points import in_morton_order
 JOIN_STDS = 3.0  # new points within it of their nearest cluster join it; others form new clusters
 MORE = 1.25  # clusters relative to the number up to which they are divided: above, small ones go
 LEAST = 1 / 32  # of the mean inertia: clusters below it are dissolved if another one is close
+SMALL = 1 / 8  # of it: clusters below it are not divided, and they make room for the ...
+LARGE = 3.0  # ... division of clusters above so many times the mean inertia
 SPLIT = 4 * MIN_COUNT  # a cluster with fewer kept points is not divided
 NEW = 0.5  # fraction of new points above which a cluster is divided because of its inertia alone
 MANY = 1.0  # new points relative to the kept ones, above which a cluster's points are regrouped
@@ -103,9 +105,7 @@ def regrouped(
         The K clusters followed by new ones; clusters without points have been dissolved.
     """
     kept = kept_counts(known.evidence)
-    losses = known.losses * trust(known.doubts)
-    gain = torch.where(losses > rule.split_loss, losses * _inertia(known, kept), 0)
-    groups = _divide(known, kept, gain, rule)
+    groups = _divide(known, kept, known.losses * trust(known.doubts), rule, exchange=True)
     before = len(groups.kinds)
     groups, owners = _joined(groups, classes, rule, rng)
     points, joined = torch.cat(classes), torch.cat(owners)
@@ -125,31 +125,33 @@ def regrouped(
     moving = (entering, homes, received - again)
     state = _reassigned(groups._replace(state=state), moving, alive, len(known), rule.floor)
     kept = kept_counts(state.evidence)  # losses in new places are not known yet
-    gain = torch.where(state.fresh > NEW * kept, _inertia(state, kept), 0)
-    groups = _divide(state, kept, gain, rule)
+    new = (state.fresh > NEW * kept).to(state.losses)
+    groups = _divide(state, kept, new, rule, exchange=False)
     return replace(groups.state, evidence=groups.evidence)
 
 
-def _divide(known: MapState, kept: Tensor, gain: Tensor, rule: Rule) -> Groups:
-    """Divide clusters in two, those of largest gain first; the second halves are appended.
+def _divide(known: MapState, kept: Tensor, losses: Tensor, rule: Rule, exchange: bool) -> Groups:
+    """Divide clusters of large loss in two; the second halves are appended.
 
     Args:
         known: K clusters.
         kept: (K,) number of their points.
-        gain: (K,) 0 for clusters that are not divided.
+        losses: (K,) mean losses of their points.
         rule: limits.
+        exchange: large clusters may be divided in exchange for small ones.
     """
     kinds, light = known.kinds, replace(known, evidence=known.evidence[:, :0])
     divided = torch.zeros_like(known.is_occupied)
-    large = (gain > 0) & (kept >= SPLIT)
+    inertia = _inertia(light, kept)
+    losses = losses.where(kept >= SPLIT, 0)
     rows, occupied = [], rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = ((kinds == kind) & (kept > 0)).nonzero().squeeze(1)
-        room = max(factor * occupied, len(own)) - len(own)
-        found = own[large[own]]
-        found = found[gain[found].argsort(descending=True, stable=True)[:room]]
+        room = factor * occupied - len(own)
+        found = _worth_dividing(losses[own], inertia[own], room, rule.split_loss)
+        found = own[found if exchange else found[: max(0, room)]]
         if kind == 0 and rule.grows and len(own):
-            occupied = len(own) + len(found)
+            occupied = len(own) + min(len(found), max(0, room))
         rows.append(found)
     chosen = torch.cat(rows)
     if len(chosen) == 0:
@@ -170,6 +172,27 @@ def _divide(known: MapState, kept: Tensor, gain: Tensor, rule: Rule) -> Groups:
     divided = torch.cat([divided.index_fill(0, chosen, True), divided.new_ones(len(chosen))])
     kept = torch.cat([kept, sizes[1]]).index_copy_(0, chosen, sizes[0])
     return Groups(light.put(chosen, both), evidence, kept, torch.cat([kinds, of_parents]), divided)
+
+
+def _worth_dividing(losses: Tensor, inertia: Tensor, room: int, split_loss: float) -> Tensor:
+    """Rows of the clusters of a class that are divided: those of large loss and inertia.
+
+    There may be ``room`` more clusters. If there is no more room, large clusters are divided in
+    exchange for small ones, which `_kept` dissolves then.
+
+    Args:
+        losses: (M,) mean loss of the points of each; 0 if it has too few to be divided.
+        inertia: (M,) see `_inertia`.
+        room: how many more clusters there may be; negative if there are too many.
+        split_loss: clusters with a smaller loss are not divided.
+    """
+    mean = inertia.mean()
+    found = ((losses > split_loss) & (inertia > SMALL * mean)).nonzero().squeeze(1)
+    order = (losses[found] * inertia[found]).argsort(descending=True, stable=True)
+    found, first = found[order], max(0, room)
+    exchanged = max(0, int((inertia < SMALL * mean).sum()) + min(0, room))
+    more = found[first:]
+    return torch.cat([found[:first], more[inertia[more] > LARGE * mean][:exchanged]])
 
 
 def _half(
@@ -260,7 +283,9 @@ def _nearest(points: Tensor, centers: Tensor) -> Tensor:
 def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     """(M,) mask of the clusters that are not dissolved.
 
-    As in k-means, clusters shall have similar inertia, so the smallest are dissolved.
+    As in k-means, clusters shall have similar inertia, so the smallest are dissolved: those of hardly
+    any inertia, small ones while there are more than the number up to which clusters are divided,
+    and any while there are `MORE` times as many.
 
     Args:
         groups: M clusters.
@@ -271,7 +296,7 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     sizes = groups.sizes + received
     alive = sizes >= (1 if rule.few else MIN_COUNT)
     inertia = _inertia(groups.state, groups.sizes, received)
-    most = MORE * rule.occupied
+    wanted, most = rule.occupied, MORE * rule.occupied
     for kind, factor in enumerate(PER_OCCUPIED):
         own = groups.rows(kind)
         some = alive[own]
@@ -279,16 +304,23 @@ def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
             some = sizes[own] > 0
         if not rule.few:
             some &= ~_needless(groups.state.means[own], inertia[own], sizes[own], some)
+            small = some & (inertia[own] < SMALL * inertia[own][some].mean())
+            excess = int(some.sum()) - factor * wanted
+            some = _without_smallest(some, inertia[own], min(excess, int(small.sum())))
         known = int((own < before).sum())
         limit = int(factor * most) if rule.grows else max(factor * rule.occupied, known)
-        excess = int(some.sum()) - max(1, limit)
-        if excess > 0:
-            order = torch.where(some, inertia[own], torch.inf).argsort(stable=True)
-            some[order[:excess]] = False
+        some = _without_smallest(some, inertia[own], int(some.sum()) - max(1, limit))
         if kind == 0:
+            wanted = max(wanted, int(some.sum()))
             most = max(MORE * int(some.sum()), rule.occupied)
         alive[own] = some
     return alive
+
+
+def _without_smallest(some: Tensor, inertia: Tensor, count: int) -> Tensor:
+    """(M,) mask of some clusters without the ``count`` of least inertia; none if it is negative."""
+    order = torch.where(some, inertia, torch.inf).argsort(stable=True)
+    return some.index_fill(0, order[: max(0, count)], False)
 
 
 def _inertia(state: MapState, sizes: Tensor, received: Tensor | int = 0) -> Tensor:

@@ -11,6 +11,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.class_balance import count_factors
+from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.evidence import kept_counts, kept_points
 from lardhm_torch.learning.fitting import (
     FitConfig,
@@ -21,6 +22,7 @@ from lardhm_torch.learning.fitting import (
 from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
+from lardhm_torch.learning.unseen import off_surfaces
 from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
@@ -37,8 +39,9 @@ def retrained(
 
     A cluster has changed if more than `FRESH` of its kept points are new.
 
-    The evidence of the neighbors of those constrains them, too. ``losses`` of the trained clusters are
-    updated.
+    The evidence of the neighbors of those constrains them, too. The classes are balanced over all
+    clusters of the state, so that the balance does not depend on which of them are trained. Unknown
+    points inside surfaces have no weight, as in `fit`. ``losses`` of the trained clusters are updated.
 
     Args:
         state: M clusters.
@@ -57,12 +60,12 @@ def retrained(
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
     points, owners = kept_points(state.evidence, rows)
-    sizes = torch.zeros_like(kept).index_copy_(0, rows, kept[rows])
     strength = evidence_weights(state, kept)
-    factors = balanced(state.kinds, strength, config, sizes) * trust(state.doubts)
+    factors = balanced(state.kinds, strength, config, kept) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
-    factors = factors.index_select(0, owners)
-    represented = float((strength * sizes).sum())
+    factors, surfaces = factors.index_select(0, owners), _surfaces(state, rows)
+    factors = _settled(points, labels, factors, surfaces, kernel.min_lengthscale)
+    represented = float((strength * kept).index_select(0, rows).sum())
     config = replace(config, l2=config.l2 * len(points) / represented)
     config = _with_enough_steps(config, len(points))
     task = FitTask(kernel, config, rng)
@@ -76,6 +79,24 @@ def retrained(
         losses=torch.where(moving & (found > 0), losses, state.losses),
         fresh=state.fresh.masked_fill(moving, 0),
     )
+
+
+def _surfaces(state: MapState, rows: Tensor) -> Clusters:
+    """The occupied clusters among some rows."""
+    rows = rows[state.is_occupied[rows]]
+    return Clusters(*(moments.index_select(0, rows) for moments in state.clusters))
+
+
+def _settled(
+    points: Tensor, labels: Tensor, factors: Tensor, surfaces: Clusters, floor: float
+) -> Tensor:
+    """(N,) loss factors, 0 for unknown points inside surfaces (`unseen.off_surfaces`).
+
+    Unknown points were sampled behind the hits of one scan, and other scans may show surfaces there.
+    """
+    unknown = (labels == UNKNOWN).nonzero().squeeze(1)
+    inside = ~off_surfaces(points.index_select(0, unknown), surfaces, floor)
+    return factors.index_fill(0, unknown[inside], 0)
 
 
 def _with_enough_steps(config: FitConfig, num_points: int) -> FitConfig:
