@@ -242,7 +242,7 @@ PAPER = UpdateConfig(as_in_paper=True)
 
 @pytest.mark.parametrize("config", [None, PAPER])
 @pytest.mark.parametrize("is_empty", [False, True])
-def test_rays_of_another_dimension_are_refused(is_empty, config):
+def test_rays_of_another_dimension_or_type_are_refused(is_empty, config):
     samples = sample_rays(box_scan(True, 0)[0])
     model, rays = LardHilbertMap(), person_scan(True, 0)[0]
     if not is_empty:
@@ -251,6 +251,8 @@ def test_rays_of_another_dimension_are_refused(is_empty, config):
     for points, labels in ((samples.points, samples.labels), ([], [])):
         with pytest.raises(ValueError, match="rays must have the 3 dimensions of the map; got 2"):
             model.update(points, labels, rays=rays, config=config)
+    with pytest.raises(ValueError, match="rays must be the Scans of the points; got Tensor"):
+        model.update(samples.points, samples.labels, rays=samples.points, config=config)
     assert len(model) == before
 
 

@@ -28,8 +28,12 @@ FEW_RAYS = 4096  # of many rays, fewer than twice as many are compared with unkn
 
 
 def check_rays(scans: Scans | None, dim: int) -> None:
-    """Raise a ValueError if there are rays, and they do not have the dimension of the map."""
-    if scans is not None and scans.dim != dim:
+    """Raise a ValueError if there are rays, and they are not scans of the dimension of the map."""
+    if scans is None:
+        return
+    if not isinstance(scans, Scans):
+        raise ValueError(f"rays must be the Scans of the points; got {type(scans).__name__}")
+    if scans.dim != dim:
         raise ValueError(f"rays must have the {dim} dimensions of the map; got {scans.dim}")
 
 
