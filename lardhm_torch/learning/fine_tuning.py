@@ -14,10 +14,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.changes import changes_map
 from lardhm_torch.learning.class_balance import balance_classes
-from lardhm_torch.learning.fitting import (
-    logistic_loss,
-    stratified_batches,
-)
+from lardhm_torch.learning.fitting import logistic_loss, stratified_batches
 from lardhm_torch.learning.parameters import MapParameters, read_state
 from lardhm_torch.learning.points import (
     blurred_hits,

@@ -13,12 +13,7 @@ from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.class_balance import count_factors
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.evidence import kept_counts, kept_points
-from lardhm_torch.learning.fitting import (
-    FitConfig,
-    FitTask,
-    fit_weights,
-    stratified_batches,
-)
+from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_weights, stratified_batches
 from lardhm_torch.learning.forgetting import trust
 from lardhm_torch.learning.map_state import MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
@@ -116,7 +111,7 @@ def trained(
         state: M clusters.
         index: search index of the centers, see `native.build_index`.
         samples: (N, D) positions [m], neighbors close to each other in memory; (N,) labels in [0, 1];
-            (N,) loss factors, mean 1.
+            (N,) loss factors.
         task: kernel, training settings and random generator.
 
     Returns:
