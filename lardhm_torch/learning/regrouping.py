@@ -3,7 +3,8 @@
 This is one step of adaptive k-means on the kept points, separately for each class. Clusters whose points
 have a large loss are divided, new points join the nearest cluster or form new clusters, all points of
 changed clusters are reassigned to their nearest centers, and clusters with too few points are dissolved
-into their neighbors.
+into their neighbors. Finally, clusters of mostly new points are divided, because their losses are not
+known yet; places that are seen only once would otherwise have too few clusters.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def regrouped(
     homes = joined[enters].split([len(part) for part in entering])
     moving = (entering, homes, received - again)
     state = _reassigned(groups._replace(state=state), moving, alive, len(known), rule.floor)
-    kept = kept_counts(state.evidence)  # losses in new places are not known yet
+    kept = kept_counts(state.evidence)
     new = (state.fresh > NEW * kept).to(state.losses)
     groups = _divide(state, kept, new, rule, exchange=False)
     return replace(groups.state, evidence=groups.evidence)
@@ -136,7 +137,7 @@ def _divide(known: MapState, kept: Tensor, losses: Tensor, rule: Rule, exchange:
     Args:
         known: K clusters.
         kept: (K,) number of their points.
-        losses: (K,) mean losses of their points.
+        losses: (K,) mean losses of their points; where these are not known, 1 or 0.
         rule: limits.
         exchange: large clusters may be divided in exchange for small ones.
     """

@@ -113,7 +113,7 @@ def figure_four(data: Path, folder: Path) -> dict[str, Any]:
 
 
 def figure_five(data: Path, folder: Path) -> dict[str, Any]:
-    """The visual-SLAM-like set, keyframe after keyframe, each adding at most 100 clusters."""
+    """The visual-SLAM-like set, keyframe after keyframe, with at most 100 clusters near each."""
     rays = rays_of(data, "sevenscenes_semidense")
     model, seconds, sizes = LardHilbertMap(), [], []
     for scan in tqdm(range(rays.num_scans), "Fig. 5", file=sys.stderr):
