@@ -4,7 +4,8 @@
 # not contain, and the network is off by default. Transformer.from_crs then returns the same heights,
 # without an error or a warning, also with only_best=True; accuracy is -1 and the description says
 # "ballpark". The geoid lies up to 100 m from the ellipsoid, so clouds of GNSS scans and terrain
-# models end up on different floors. allow_ballpark=False raises an error: use it, and install the grid.
+# models end up on different floors. It is intended (PROJ issue 1743). allow_ballpark=False raises an error:
+# use it, and install the grid.
 #
 # Output seen:
 #   EGM2008: 100.0 m -> 100.0 m, only_best 100.0 m, accuracy -1.0, 0 warnings

@@ -4,7 +4,7 @@
 # at index -1, next to its first corner: a free room of 2 m x 3 m has an obstacle 0.05 m from one corner
 # and 3.56 m from the opposite one. There is no warning, and return_indices names row -1, which numpy
 # takes for the last row. The same grid gives infinity in edt 3.1.2 and 3.4e38 in OpenCV 5.0.0.
-# Cure: fill the result with infinity unless (grid == 0).any().
+# Known (scipy issues 1616 and 15585). Cure: fill the result with infinity unless (grid == 0).any().
 #
 # Output seen:
 #   clearance 0.05 to 3.56 m, nearest obstacle in cell [-1, 0]; edt inf, OpenCV 3.4e+38
