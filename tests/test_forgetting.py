@@ -109,7 +109,7 @@ def known_wall():
 def test_halves_of_a_cluster_in_doubt_are_in_doubt():
     part = replace(known_wall(), doubts=torch.full((4,), 2.0))
     rule = Rule(occupied=8, grows=True, few=False, split_loss=0.01, floor=0.01)
-    groups = _divide(part, kept_counts(part.evidence), torch.ones(4), rule, exchange=True)
+    groups = _divide(part, torch.ones(4), rule, exchange=True)
     assert groups.changed.sum() == 8
     assert torch.equal(groups.state.doubts, torch.full((8,), 2.0))
 

@@ -105,8 +105,7 @@ def regrouped(
     Returns:
         The K clusters followed by new ones; clusters without points have been dissolved.
     """
-    kept = kept_counts(known.evidence)
-    groups = _divide(known, kept, known.losses * trust(known.doubts), rule, exchange=True)
+    groups = _divide(known, known.losses * trust(known.doubts), rule, exchange=True)
     before = len(groups.kinds)
     groups, owners = _joined(groups, classes, rule, rng)
     points, joined = torch.cat(classes), torch.cat(owners)
@@ -125,24 +124,22 @@ def regrouped(
     homes = joined[enters].split([len(part) for part in entering])
     moving = (entering, homes, received - again)
     state = _reassigned(groups._replace(state=state), moving, alive, len(known), rule.floor)
-    kept = kept_counts(state.evidence)
-    new = (state.fresh > NEW * kept).to(state.losses)
-    groups = _divide(state, kept, new, rule, exchange=False)
+    new = (state.fresh > NEW * kept_counts(state.evidence)).to(state.losses)
+    groups = _divide(state, new, rule, exchange=False)
     return replace(groups.state, evidence=groups.evidence)
 
 
-def _divide(known: MapState, kept: Tensor, losses: Tensor, rule: Rule, exchange: bool) -> Groups:
+def _divide(known: MapState, losses: Tensor, rule: Rule, exchange: bool) -> Groups:
     """Divide clusters of large loss in two; the second halves are appended.
 
     Args:
         known: K clusters.
-        kept: (K,) number of their points.
         losses: (K,) mean losses of their points; where these are not known, 1 or 0.
         rule: limits.
         exchange: large clusters may be divided in exchange for small ones.
     """
     kinds, light = known.kinds, replace(known, evidence=known.evidence[:, :0])
-    divided = torch.zeros_like(known.is_occupied)
+    divided, kept = torch.zeros_like(known.is_occupied), kept_counts(known.evidence)
     inertia = _inertia(light, kept)
     losses = losses.where(kept >= SPLIT, 0)
     rows, occupied = [], rule.occupied
