@@ -281,7 +281,7 @@ def _nearest(points: Tensor, centers: Tensor) -> Tensor:
 def _kept(groups: Groups, received: Tensor, before: int, rule: Rule) -> Tensor:
     """(M,) mask of the clusters that are not dissolved.
 
-    As in k-means, clusters shall have similar inertia, so the smallest are dissolved: those of hardly
+    As in k-means, clusters should have similar inertia, so the smallest are dissolved: those of hardly
     any inertia, small ones while there are more than the number up to which clusters are divided,
     and any while there are `MORE` times as many.
 
