@@ -91,7 +91,7 @@ def factors_of(state, fresh, monkeypatch):
         retraining, "trained", lambda *given: found.append(given[2]) or trained(*given)
     )
     state.fresh[:] = 100.0 * fresh
-    retrained(state, 10_000, LardHilbertMap().kernel, UPDATE_FIT, generator())
+    retrained(state, 10**6, LardHilbertMap().kernel, UPDATE_FIT, generator())
     return found[0]
 
 
