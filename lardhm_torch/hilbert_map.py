@@ -53,7 +53,7 @@ class LardHilbertMap(MapClasses):
             that any value is valid. `scale_tril` has the factors of the kernels [m].
         is_occupied, counts, means, scatters: (M, ...) buffers, class and moments of the clusters;
             clusters of unknown points have count 0.
-        evidence: (M, 32, D) buffer [m], kept points: a bounded random sample of the points of each
+        evidence: (M, 64, D) buffer [m], kept points: a bounded random sample of the points of each
             cluster, padded with infinity.
         losses, doubts, fresh, times: (M,) buffers, used by `update` (see docs).
         max_age: `update` removes clusters that were not seen for longer [s]; None: never. Saved.

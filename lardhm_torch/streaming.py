@@ -54,7 +54,7 @@ class StreamConfig:
 
 
 def real_time(config: StreamConfig | None = None) -> StreamConfig:
-    """Settings for real-time updates: fewer points per scan, and fewer clusters trained per update.
+    """Settings for real-time updates: fewer points per scan, and fewer kept points trained per update.
 
     benchmarks/incremental.py measures time and accuracy.
 
@@ -68,7 +68,7 @@ def real_time(config: StreamConfig | None = None) -> StreamConfig:
     return replace(
         config,
         sampling=replace(config.sampling, free_samples=2, near_samples=1),
-        update=replace(config.update, cell_edge=0.2, max_points=10_000, max_trained=2_500),
+        update=replace(config.update, cell_edge=0.2, max_points=10_000, max_trained_points=30_000),
     )
 
 

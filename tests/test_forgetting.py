@@ -15,10 +15,10 @@ from lardhm_torch.learning import parameters
 from lardhm_torch.learning.clustering import Clusters, cluster_points
 from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
 from lardhm_torch.learning.forgetting import (
+    AGAIN,
     DOUBT,
     GONE,
     OVERRULED,
-    URGENT,
     doubted,
     forget,
     trust,
@@ -76,10 +76,10 @@ def test_trust_in_a_contradicted_cluster_falls_and_returns_with_a_hit():
     doubted_part = replace(part, doubts=torch.full_like(part.doubts, 2 * DOUBT))
     after = forget(doubted_part, part.doubts)
     assert torch.equal(after.evidence, part.evidence)
-    urgent = URGENT * kept_counts(part.evidence).to(after.fresh)
-    assert torch.equal(after.fresh, urgent)
+    again_trained = AGAIN * kept_counts(part.evidence).to(after.fresh)
+    assert torch.equal(after.fresh, again_trained)
     again = forget(replace(after, doubts=part.doubts, fresh=part.fresh), after.doubts)
-    assert torch.equal(again.fresh, urgent)
+    assert torch.equal(again.fresh, again_trained)
     assert torch.equal(forget(part, part.doubts).fresh, part.fresh)
 
 
@@ -117,7 +117,7 @@ def test_halves_of_a_cluster_in_doubt_are_in_doubt():
 def test_clusters_have_the_covariances_of_their_kept_points_however_often_they_were_seen():
     model = LardHilbertMap().fit(*wall(), num_clusters=40)
     for seed in range(1, 31):
-        model.update(*wall(seed), seed=seed, config=UpdateConfig(split_loss=1e9))
+        model.update(*wall(5 * seed), seed=seed, config=UpdateConfig(split_loss=1e9))
     found = parameters.read_state(model).clusters
     kept = evidence_moments(model.evidence)
     assert found.counts.max() > 3 * EVIDENCE

@@ -170,13 +170,14 @@ def test_a_floor_stays_although_rays_graze_it():
 def test_clearance_follows_with_the_scan_in_which_a_box_disappears():
     model = LardHilbertMap()
     for number in range(6):
-        scan, on_box = box_scan(True, number)
-        learn_stream(model, scan, number)
-    before, place = scan.ends[on_box], torch.tensor([[3.6, 0.0, 0.0]], dtype=F64)
+        learn_stream(model, box_scan(True, number)[0], number)
+    along = torch.linspace(-0.4, 0.4, 41, dtype=F64)
+    front = torch.cartesian_prod(torch.linspace(3.96, 4.04, 5, dtype=F64), along, along)
+    place = torch.tensor([[3.6, 0.0, 0.0]], dtype=F64)
     assert float(clearance(model, place)) < 0.41
     for number in range(6, 16):
         learn_stream(model, box_scan(False, number)[0], number)
-        occupied = float((model(before) > 0.5).double().mean())
+        occupied = float((model(front) > 0.5).double().mean())
         near = float(clearance(model, place))
         if occupied == 0:
             break

@@ -328,6 +328,23 @@ def test_scans_that_each_see_a_little_more_make_finer_clusters():
     assert sizes[-1] > 3 * sizes[0]
 
 
+@pytest.mark.parametrize("number", [5, EVIDENCE + 7])
+def test_maps_that_kept_other_numbers_of_points_are_read(number):
+    model = wall_map()
+    state = model.state_dict()
+    more = torch.nn.functional.pad(state["evidence"], (0, 0, 0, 7), value=torch.inf)
+    state["evidence"] = more[:, :number]
+    other = LardHilbertMap().double()
+    other.load_state_dict(state)
+    kept = min(number, EVIDENCE)
+    assert other.evidence.shape == model.evidence.shape
+    assert torch.equal(other.evidence[:, :kept], model.evidence[:, :kept])
+    assert other.evidence[:, kept:].isinf().all()
+    points, labels = wall(seed=9)
+    other.update(points, labels)
+    assert ((other(points) > 0.5) == (labels > 0.5)).double().mean() > 0.95
+
+
 def test_a_map_saved_without_its_evidence_is_small_and_learns_on(tmp_path):
     whole = wall_map()
     whole.save(tmp_path / "whole.pt")

@@ -8,9 +8,15 @@ from small_maps import wall
 
 from lardhm_torch import LardHilbertMap, Scans, StreamConfig, UpdateConfig
 from lardhm_torch.learning import parameters, retraining
-from lardhm_torch.learning.evidence import evidence_moments, keep_points
+from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_points, kept_counts
 from lardhm_torch.learning.map_state import new_rows
-from lardhm_torch.learning.retraining import _with_enough_steps, balanced, retrained
+from lardhm_torch.learning.retraining import (
+    FEWEST,
+    _first_points,
+    _with_enough_steps,
+    balanced,
+    retrained,
+)
 from lardhm_torch.learning.update import UPDATE_FIT, _thinned
 from lardhm_torch.native.thinning import PER_CELL
 from lardhm_torch.scans import seeded_generator
@@ -83,6 +89,24 @@ def test_few_points_give_as_many_steps_as_needed(num_points):
     assert num_points < 100_000 or config.passes == 2
 
 
+def test_of_many_kept_points_every_cluster_uses_its_first_ones():
+    points = torch.rand(1000, 3, generator=generator(), dtype=torch.float64)
+    owners = (50 * points[:, 0] ** 3).long()
+    evidence = keep_points(points, owners, 50)
+    kept = kept_counts(evidence)
+    rows = torch.arange(49, -1, -2)
+    found, of_found, used = _first_points(evidence, rows, kept, 10**6)
+    assert len(found) == int(kept[rows].sum())
+    assert torch.equal(used, kept)
+    total = int(kept[rows].sum())
+    found, of_found, used = _first_points(evidence, rows, kept, total // 4)
+    assert torch.equal(used, kept.clamp(max=EVIDENCE // 4))
+    assert kept.max() > EVIDENCE // 4
+    for row in rows.tolist():
+        assert torch.equal(found[of_found == row], evidence[row, : used[row]])
+    assert int(_first_points(evidence, rows, kept, 1)[2].max()) == FEWEST
+
+
 def factors_of(state, fresh, monkeypatch):
     """Points, labels and loss factors on which an update trains if some clusters are fresh."""
     found = []
@@ -91,7 +115,7 @@ def factors_of(state, fresh, monkeypatch):
         retraining, "trained", lambda *given: found.append(given[2]) or trained(*given)
     )
     state.fresh[:] = 100.0 * fresh
-    retrained(state, 10_000, LardHilbertMap().kernel, UPDATE_FIT, generator())
+    retrained(state, 10**6, LardHilbertMap().kernel, UPDATE_FIT, generator())
     return found[0]
 
 

@@ -33,7 +33,7 @@ AROUND = 8  # so many occupied clusters, the cluster itself included, are asked 
 MOST = 0.6  # ... this fraction of them is in doubt, too,
 REACH = 4.0  # ... if they are no farther away than so many standard deviations along a surface
 GONE = 10 * DOUBT  # doubt at which a cluster is removed
-URGENT = 1000  # clusters whose trust changed are trained before others
+AGAIN = 1 / 4  # of the points of a cluster whose trust changed counts as new: it is trained again
 OVERRULED = 0.3  # mean loss of a cluster of unknown points that other evidence contradicts
 
 
@@ -125,5 +125,7 @@ def forget(known: MapState, before: Tensor) -> MapState:
         known,
         evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
-        fresh=known.fresh.index_copy(0, rows, (URGENT * kept).to(known.fresh)),
+        fresh=known.fresh.index_copy(
+            0, rows, known.fresh[rows].maximum((AGAIN * kept).to(known.fresh))
+        ),
     )

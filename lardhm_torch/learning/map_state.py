@@ -10,7 +10,7 @@ from torch import Tensor
 from lardhm_torch.features import raw_factors
 from lardhm_torch.learning.clustering import Clusters, Columns
 
-EVIDENCE = 32  # E, number of points that a cluster keeps
+EVIDENCE = 64  # E, number of points that a cluster keeps
 NEVER = torch.finfo(torch.float64).min  # time of clusters that were learned without a time stamp
 PER_MAP = ("origin", "posterior_scales")  # tensors without one row per cluster
 HISTORY = ("evidence", "losses", "doubts", "fresh", "times")  # used by updates only
@@ -121,6 +121,12 @@ def no_channels(means: Tensor) -> tuple[Tensor, Tensor]:
 def no_times(weights: Tensor) -> Tensor:
     """(M,) weights -> (M,) `NEVER`: clusters that were learned without a time stamp."""
     return torch.full_like(weights, NEVER, dtype=torch.float64)
+
+
+def fitting_evidence(evidence: Tensor) -> Tensor:
+    """(M, any, D) evidence, also of a map that kept another number of points -> (M, E, D)."""
+    more = EVIDENCE - evidence.shape[1]
+    return torch.nn.functional.pad(evidence, (0, 0, 0, more), value=torch.inf)
 
 
 def no_evidence(means: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from lardhm_torch.learning.unseen import off_surfaces
 from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
-BLOCK = 256  # clusters that are chosen for training together
+FEWEST = 8  # so many points of a cluster are used in any case, if it keeps them
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
@@ -40,13 +40,13 @@ def retrained(
 
     Args:
         state: M clusters.
-        limit: maximum number of changed clusters to train; the others are trained later.
+        limit: number of kept points to train on; see `_first_points`.
         kernel: kernel settings of the map.
         config: passes, rates and regularizer.
         rng: random generator.
     """
     kept = kept_counts(state.evidence)
-    changed = _stalest(state, kept, limit)
+    changed = state.fresh > FRESH * kept
     if not bool(changed.any()):
         return state
     index = native.build_index(state.centers, kernel.num_neighbors)
@@ -54,7 +54,7 @@ def retrained(
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
-    points, owners = kept_points(state.evidence, rows)
+    points, owners, kept = _first_points(state.evidence, rows, kept, limit)
     strength = evidence_weights(state, kept)
     factors = balanced(state.kinds, strength, config, kept) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
@@ -74,6 +74,26 @@ def retrained(
         losses=torch.where(moving & (found > 0), losses, state.losses),
         fresh=state.fresh.masked_fill(moving, 0),
     )
+
+
+def _first_points(
+    evidence: Tensor, rows: Tensor, kept: Tensor, limit: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The first kept points of some clusters, as many of each as the limit allows.
+
+    Args:
+        evidence: (M, E, D).
+        rows: (Q,) clusters.
+        kept: (M,) number of their points.
+        limit: number of points in all; above it, clusters with more than `FEWEST` points use fewer.
+
+    Returns:
+        (L, D) points; (L,) their clusters; (M,) number of points that each cluster uses.
+    """
+    most = max(FEWEST, int(evidence.shape[1] * limit / max(1, int(kept[rows].sum()))))
+    first = evidence.index_select(0, rows)[:, :most].contiguous()
+    points, places = kept_points(first)
+    return points, rows.index_select(0, places), kept.clamp(max=most)
 
 
 def _surfaces(state: MapState, rows: Tensor) -> Clusters:
@@ -154,31 +174,6 @@ def excess_losses(
     log_odds = (values * weights[indices]).sum(dim=1)
     loss = torch.nn.functional.binary_cross_entropy_with_logits(log_odds, labels, reduction="none")
     return loss + torch.xlogy(labels, labels) + torch.xlogy(1 - labels, 1 - labels)
-
-
-def _stalest(state: MapState, kept: Tensor, limit: int) -> Tensor:
-    """(M,) mask of the clusters with the largest fractions of new points, at most ``limit``.
-
-    They are chosen in blocks of clusters that are close to each other, because the neighbors of the
-    chosen ones are needed, too.
-
-    Args:
-        state: M clusters.
-        kept: (M,) number of their kept points.
-        limit: maximum number.
-    """
-    share = state.fresh / kept
-    changed = share > FRESH
-    if int(changed.sum()) <= limit:
-        return changed
-    order = morton_order(state.centers)
-    block = torch.empty_like(order)
-    block[order] = torch.arange(len(order), device=order.device) // BLOCK
-    count = int(block.max()) + 1
-    total = torch.zeros(count, device=order.device).index_add_(0, block, (share * changed).float())
-    chosen = torch.zeros(count, dtype=torch.bool, device=order.device)
-    chosen[total.topk(max(1, limit // BLOCK)).indices] = True
-    return changed & chosen[block]
 
 
 def _neighbors(mask: Tensor, centers: Tensor, num_neighbors: int, index: Tensor) -> Tensor:

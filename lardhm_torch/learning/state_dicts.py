@@ -11,7 +11,14 @@ from torch import Tensor
 from lardhm_torch.channels import CLASS
 from lardhm_torch.io import map_files
 from lardhm_torch.learning.channel_sums import Layout, check_layout, num_rows
-from lardhm_torch.learning.map_state import CHANNELS, HISTORY, PER_MAP, no_evidence, no_times
+from lardhm_torch.learning.map_state import (
+    CHANNELS,
+    HISTORY,
+    PER_MAP,
+    fitting_evidence,
+    no_evidence,
+    no_times,
+)
 from lardhm_torch.learning.map_tensors import MapTensors
 from lardhm_torch.learning.resizing import resize, set_channels
 from lardhm_torch.learning.state_checks import check_values
@@ -104,7 +111,7 @@ def _class_scale(state: dict[str, Any], prefix: str) -> float:
 
 
 def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
-    """Add empty evidence to the state dict of a map that was saved without it."""
+    """Add evidence to the state dict of a map that was saved without it or with fewer points."""
     centers = state.get(prefix + "centers")
     if not isinstance(centers, Tensor) or centers.ndim != 2:
         return
@@ -113,6 +120,9 @@ def _fill_evidence(state: dict[str, Any], prefix: str) -> None:
             zeros = centers.new_zeros(len(centers))
             empty = {"evidence": no_evidence(centers), "times": no_times(zeros)}
             state[prefix + name] = empty.get(name, zeros)
+    kept = state[prefix + "evidence"]
+    if isinstance(kept, Tensor) and kept.ndim == 3:
+        state[prefix + "evidence"] = fitting_evidence(kept)
 
 
 def drop_spare_rows(model: MapTensors, state: dict[str, Any], prefix: str, *_: Any) -> None:

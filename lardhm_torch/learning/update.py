@@ -52,11 +52,11 @@ class UpdateConfig:
     split_loss: float = 0.003  # clusters whose points have a larger mean log-loss are divided
     cell_edge: float = 0.05  # [m] in a cell of this edge, at most 4 new points of a class are used
     max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
-    max_trained: int = 5_000  # maximum number of changed clusters to train; the others follow later
+    max_trained_points: int = 60_000  # of more kept points, all clusters use their first ones only
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
-        for name in ("zeta", "split_loss", "cell_edge", "max_points", "max_trained"):
+        for name in ("zeta", "split_loss", "cell_edge", "max_points", "max_trained_points"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0; got {getattr(self, name)}")
 
@@ -126,7 +126,7 @@ def updated(
     alive = keeps_points(part.evidence)
     part = handed_over(part, alive)
     part = part if bool(alive.all()) else part.rows(alive)
-    part = retrained(part, config.max_trained, kernel, config.fit, rng)
+    part = retrained(part, config.max_trained_points, kernel, config.fit, rng)
     return _without(nearby, part, alive)
 
 
