@@ -100,9 +100,9 @@ def test_updates_keep_every_hit_and_add_new_classes_and_channels():
         for name, count in expected.items():
             assert model.channels[name].counts.sum().item() == pytest.approx(count, rel=1e-9)
     assert sorted(model.classes) == [3, 7, 9]
-    torch.testing.assert_close(
-        model.channel(surface_points(), "color"), ramp(surface_points()), rtol=0, atol=0.04
-    )
+    errors = (model.channel(surface_points(), "color") - ramp(surface_points())).abs()
+    assert errors.mean() < 0.01
+    assert errors.max() < 0.05  # halves of a cluster have the same color at first
     before = total(model, "class")
     model.update(*wall(100, seed=9), seed=9)  # a scan without channels
     torch.testing.assert_close(total(model, "class"), before)

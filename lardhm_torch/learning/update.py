@@ -52,7 +52,7 @@ class UpdateConfig:
     split_loss: float = 0.003  # clusters whose points have a larger mean log-loss are divided
     cell_edge: float = 0.05  # [m] in a cell of this edge, at most 4 new points of a class are used
     max_points: int = 20_000  # maximum number of new points of each class; a random subset is used
-    max_trained_points: int = 60_000  # of more kept points, all clusters use their first ones only
+    max_trained_points: int = 150_000  # of more kept points, all clusters use their first ones only
     fit: FitConfig = UPDATE_FIT
 
     def __post_init__(self) -> None:
