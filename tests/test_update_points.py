@@ -12,6 +12,7 @@ from lardhm_torch.learning.evidence import EVIDENCE, evidence_moments, keep_poin
 from lardhm_torch.learning.map_state import new_rows
 from lardhm_torch.learning.retraining import (
     FEWEST,
+    SMALL_LOSS,
     _first_points,
     _with_enough_steps,
     balanced,
@@ -91,20 +92,30 @@ def test_few_points_give_as_many_steps_as_needed(num_points):
 
 def test_of_many_kept_points_every_cluster_uses_its_first_ones():
     points = torch.rand(1000, 3, generator=generator(), dtype=torch.float64)
-    owners = (50 * points[:, 0] ** 3).long()
-    evidence = keep_points(points, owners, 50)
+    owners = (40 * points[:, 0] ** 2).long()
+    evidence = keep_points(points, owners, 40)
+    state = new_rows(evidence_moments(evidence), torch.ones(40, dtype=torch.bool), 0.02, evidence)
     kept = kept_counts(evidence)
-    rows = torch.arange(49, -1, -2)
-    found, of_found, used = _first_points(evidence, rows, kept, 10**6)
-    assert len(found) == int(kept[rows].sum())
+    rows = torch.arange(39, -1, -2)
+    found, _, used = _first_points(state, rows, kept, 10**6)
+    total = len(found)
+    assert total == int(kept[rows].sum())
     assert torch.equal(used, kept)
-    total = int(kept[rows].sum())
-    found, of_found, used = _first_points(evidence, rows, kept, total // 4)
-    assert torch.equal(used, kept.clamp(max=EVIDENCE // 4))
-    assert kept.max() > EVIDENCE // 4
+    found, of_found, used = _first_points(state, rows, kept, total // 2)
+    assert torch.equal(used, kept.clamp(max=EVIDENCE // 2))
+    assert kept.max() > EVIDENCE // 2
     for row in rows.tolist():
         assert torch.equal(found[of_found == row], evidence[row, : used[row]])
-    assert int(_first_points(evidence, rows, kept, 1)[2].max()) == FEWEST
+    assert torch.equal(_first_points(state, rows, kept, 1)[2], kept.clamp(max=FEWEST))
+
+
+def test_clusters_that_are_predicted_well_use_few_kept_points():
+    points = torch.rand(200, 3, generator=generator(), dtype=torch.float64)
+    evidence = keep_points(points, torch.arange(200) % 4, 4)
+    state = new_rows(evidence_moments(evidence), torch.ones(4, dtype=torch.bool), 0.02, evidence)
+    state.losses[:] = torch.tensor([0.0, 0.1 * SMALL_LOSS, 0.9 * SMALL_LOSS, 1.1 * SMALL_LOSS])
+    used = _first_points(state, torch.arange(4), kept_counts(evidence), 10**6)[2]
+    assert used.tolist() == [50, FEWEST, FEWEST, 50]
 
 
 def factors_of(state, fresh, monkeypatch):

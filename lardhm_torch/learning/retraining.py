@@ -12,16 +12,17 @@ from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.class_balance import count_factors
 from lardhm_torch.learning.clustering import Clusters
-from lardhm_torch.learning.evidence import kept_counts, kept_points
+from lardhm_torch.learning.evidence import first_points, kept_counts, kept_points
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_weights, stratified_batches
 from lardhm_torch.learning.forgetting import trust
-from lardhm_torch.learning.map_state import MapState
+from lardhm_torch.learning.map_state import EVIDENCE, MapState
 from lardhm_torch.learning.points import blurred_hits, morton_order
 from lardhm_torch.learning.unseen import off_surfaces
 from lardhm_torch.sampling import UNKNOWN
 
 FRESH = 1 / 16  # fraction of new points above which the weight of a cluster is trained
-FEWEST = 8  # so many points of a cluster are used in any case, if it keeps them
+FEWEST = 16  # kept points of a cluster that are used in any case, and all of those with a ...
+SMALL_LOSS = 0.003  # ... smaller mean loss use
 MIN_BATCHES, MIN_STEPS = 8, 64  # per pass, and in all: few points give enough steps, too
 LOSS_STRIDE = 4  # losses are estimated from one of so many samples
 KIND_LABELS = torch.tensor([1.0, 0.0, UNKNOWN])  # of the classes in `MapState.kinds`
@@ -54,7 +55,7 @@ def retrained(
     beside = _neighbors(moving & ~changed, state.centers, kernel.num_neighbors, index)
     rows = (moving | beside).nonzero().squeeze(1)
     rows = rows[morton_order(state.centers[rows])]
-    points, owners, kept = _first_points(state.evidence, rows, kept, limit)
+    points, owners, kept = _first_points(state, rows, kept, limit)
     strength = evidence_weights(state, kept)
     factors = balanced(state.kinds, strength, config, kept) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
@@ -77,23 +78,26 @@ def retrained(
 
 
 def _first_points(
-    evidence: Tensor, rows: Tensor, kept: Tensor, limit: int
+    state: MapState, rows: Tensor, kept: Tensor, limit: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The first kept points of some clusters, as many of each as the limit allows.
+    """The first kept points of some clusters: few of those with a small loss, more of the others.
 
     Args:
-        evidence: (M, E, D).
+        state: M clusters; a loss of 0 is not known.
         rows: (Q,) clusters.
         kept: (M,) number of their points.
-        limit: number of points in all; above it, clusters with more than `FEWEST` points use fewer.
+        limit: number of points in all, about; above it, fewer than all points are used, but `FEWEST`.
 
     Returns:
         (L, D) points; (L,) their clusters; (M,) number of points that each cluster uses.
     """
-    most = max(FEWEST, int(evidence.shape[1] * limit / max(1, int(kept[rows].sum()))))
-    first = evidence.index_select(0, rows)[:, :most].contiguous()
+    is_easy = (state.losses > 0) & (state.losses < SMALL_LOSS)
+    used = torch.where(is_easy, kept.clamp(max=FEWEST), kept)
+    most = EVIDENCE * limit / max(1, int(used[rows].sum()))
+    used = used.clamp(max=max(FEWEST, int(most)))
+    first = first_points(state.evidence.index_select(0, rows), used[rows])
     points, places = kept_points(first)
-    return points, rows.index_select(0, places), kept.clamp(max=most)
+    return points, rows.index_select(0, places), used
 
 
 def _surfaces(state: MapState, rows: Tensor) -> Clusters:
