@@ -19,6 +19,7 @@ from torch import Tensor
 from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import feature_sums
+from lardhm_torch.learning.cluster_matching import take_clusters
 from lardhm_torch.learning.clustering import split_labels
 from lardhm_torch.learning.evidence import kept_counts
 from lardhm_torch.learning.map_state import MapState
@@ -83,7 +84,8 @@ def _shared(known: MapState, doubts: Tensor) -> Tensor:
     occupied = known.is_occupied.nonzero().squeeze(1)
     centers, others = known.centers[rows], known.centers[occupied]
     near = native.nearest_centers(centers, others, min(AROUND, len(others))).long()
-    variances = known.clusters.covariances[rows].diagonal(dim1=1, dim2=2).sum(dim=1)
+    covariances = take_clusters(known.clusters, rows).covariances
+    variances = covariances.diagonal(dim1=1, dim2=2).sum(dim=1)
     reach = REACH * (variances / max(1, centers.shape[1] - 1)).sqrt()
     around = (others[near] - centers[:, None]).norm(dim=2) <= reach[:, None]
     in_doubt = around & (doubts[occupied[near]] >= DOUBT)
@@ -118,6 +120,7 @@ def forget(known: MapState, before: Tensor) -> MapState:
     lost = (known.doubts > GONE) | ((known.kinds == 2) & (known.losses > OVERRULED))
     rows = (lost | (trust(known.doubts) != trust(before))).nonzero().squeeze(1)
     kept = kept_counts(known.evidence.index_select(0, rows))
+    fresh = known.fresh[rows].maximum((AGAIN * kept).to(known.fresh))
     evidence = known.evidence
     if bool(lost.any()):
         evidence = evidence.index_fill(0, lost.nonzero().squeeze(1), torch.inf)
@@ -125,7 +128,5 @@ def forget(known: MapState, before: Tensor) -> MapState:
         known,
         evidence=evidence,
         channel_sums=known.channel_sums.masked_fill(lost[:, None, None], 0),
-        fresh=known.fresh.index_copy(
-            0, rows, known.fresh[rows].maximum((AGAIN * kept).to(known.fresh))
-        ),
+        fresh=known.fresh.index_copy(0, rows, fresh),
     )

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lardhm_torch import native
 from lardhm_torch.learning.assignment import nearest_clusters
+from lardhm_torch.learning.cluster_matching import take_clusters
 from lardhm_torch.learning.clustering import (
     MIN_COUNT,
     Clusters,
@@ -235,7 +236,7 @@ def _joined(
     start = len(groups.kinds)
     for kind, points in enumerate(classes):
         rows = groups.rows(kind)
-        near = Clusters(*(moments.index_select(0, rows) for moments in groups.state.clusters))
+        near = take_clusters(groups.state.clusters, rows)
         own = nearest_clusters(points, near, rule.floor, JOIN_STDS)
         far = (own < 0).nonzero().squeeze(1)
         joined = rows.index_select(0, own.clamp(min=0)) if len(rows) else own

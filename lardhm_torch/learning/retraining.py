@@ -11,6 +11,7 @@ from lardhm_torch import native
 from lardhm_torch.features import Kernel
 from lardhm_torch.learning.assignment import ordered_features
 from lardhm_torch.learning.class_balance import count_factors
+from lardhm_torch.learning.cluster_matching import take_clusters
 from lardhm_torch.learning.clustering import Clusters
 from lardhm_torch.learning.evidence import first_points, kept_counts, kept_points
 from lardhm_torch.learning.fitting import FitConfig, FitTask, fit_weights, stratified_batches
@@ -59,7 +60,8 @@ def retrained(
     strength = evidence_weights(state, kept)
     factors = balanced(state.kinds, strength, config, kept) * trust(state.doubts)
     labels = KIND_LABELS.to(points)[state.kinds].index_select(0, owners)
-    factors, surfaces = factors.index_select(0, owners), _surfaces(state, rows)
+    factors = factors.index_select(0, owners)
+    surfaces = take_clusters(state.clusters, rows[state.is_occupied[rows]])
     factors = _settled(points, labels, factors, surfaces, kernel.min_lengthscale)
     represented = float((strength * kept).index_select(0, rows).sum())
     config = replace(config, l2=config.l2 * len(points) / represented)
@@ -98,12 +100,6 @@ def _first_points(
     first = first_points(state.evidence.index_select(0, rows), used[rows])
     points, places = kept_points(first)
     return points, rows.index_select(0, places), used
-
-
-def _surfaces(state: MapState, rows: Tensor) -> Clusters:
-    """The occupied clusters among some rows."""
-    rows = rows[state.is_occupied[rows]]
-    return Clusters(*(moments.index_select(0, rows) for moments in state.clusters))
 
 
 def _settled(

@@ -31,9 +31,7 @@ from lardhm_torch.tiles.indexing import Folder, Index, tile_name, tile_path
 from lardhm_torch.tiles.manifest import Manifest
 from lardhm_torch.tiles.splitting import TileState, state_of
 
-CLUSTER_BYTES = (
-    1000  # upper bound for a 3-D float32 map with its index; float64 takes twice as much
-)
+CLUSTER_BYTES = 1000  # upper bound for a 3-D float32 map with its index; twice as much in float64
 Value = TypeVar("Value")
 Entries = OrderedDict[Hashable, tuple[Value, int]]  # values and their sizes in bytes
 
